@@ -21,7 +21,7 @@ import numpy as np
 
 import telemetry
 from benchmarks.speed.daemon_refine import record
-from gcs_plugin.bench.live_errors import live_errors
+from gcs_plugin.bench.accuracy import live_errors
 from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.intake.posted_pose import parse_pose
 from gcs_plugin.daemon.settings import Settings

@@ -10,9 +10,9 @@ from typing import Any
 from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.commands import Order, Verb
 from gcs_plugin.fleet.fleet import Fleet
-from gcs_plugin.fleet.fleet_events import FleetEvent
 from gcs_plugin.fleet.flight_state import Word, flight_state, summary
 from gcs_plugin.fleet.preflight import Check, preflight_all
+from gcs_plugin.fleet.reception import FleetEvent
 from gcs_plugin.fleet.separation.takeoff_schedule import TakeoffSchedule
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot, Message
@@ -46,11 +46,7 @@ class Backend(abc.ABC):
 
     @abc.abstractmethod
     def vehicle(self, system: int) -> Vehicle:
-        """One of them.
-
-        Raises:
-            InputError: it was not found.
-        """
+        """One of them; raises InputError: it was not found."""
 
     @abc.abstractmethod
     def is_known(self, vehicle: Vehicle) -> bool:
@@ -193,7 +189,8 @@ class Backend(abc.ABC):
             ended = {event.system for event in self.events if event.kind in ("complete", "aborted")}
             vehicles = self.vehicles()
             followed = set(systems) or set(vehicles)
-            if followed and followed <= ended and not any(_comes_home(v) for s, v in vehicles.items() if s in followed):
+            words = {flight_state(vehicle).word for system, vehicle in vehicles.items() if system in followed}
+            if followed and followed <= ended and not words & {Word.RETURNING, Word.LANDING}:
                 return True
             if time.monotonic() >= end:
                 return False
@@ -203,10 +200,6 @@ class Backend(abc.ABC):
     @abc.abstractmethod
     def close(self) -> None:
         """Close the links."""
-
-
-def _comes_home(vehicle: Vehicle) -> bool:
-    return flight_state(vehicle).word in (Word.RETURNING, Word.LANDING)
 
 
 def command_all(

@@ -18,9 +18,9 @@ from gcs_plugin.backends.backend import Backend, Report
 from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.commands import URGENT, Order, Verb
 from gcs_plugin.fleet.dialogues import continued, resumed
-from gcs_plugin.fleet.fleet_events import FleetEvent, mission_event
 from gcs_plugin.fleet.heard_messages import HEARD, MESSAGE_IDS, rates_of
 from gcs_plugin.fleet.message_rates import Streams
+from gcs_plugin.fleet.reception import FleetEvent, mission_event
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import AUTOPILOT_COMPONENT, Autopilot, Message, is_vehicle
 from gcs_plugin.links.transports import parse_address
@@ -74,11 +74,7 @@ class MavsdkBackend(Backend):
     name = "mavsdk"
 
     def __init__(self, links: Sequence[str], *, own: Address) -> None:
-        """Open the links.
-
-        Raises:
-            InputError: MAVSDK is missing, or an address is wrong.
-        """
+        """Open the links; raises InputError: MAVSDK is missing, or an address is wrong."""
         try:
             from mavsdk import Configuration, ConnectionResult, Mavsdk, log_subscribe
         except ImportError as error:

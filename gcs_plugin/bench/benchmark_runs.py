@@ -137,11 +137,7 @@ def share(value: float | None, digits: int = 1) -> str:
 
 
 def numbers(value: str, flag: str) -> list[int]:
-    """A comma-separated list of positive whole numbers.
-
-    Raises:
-        InputError: if it is not such a list.
-    """
+    """A comma-separated list of positive whole numbers; raises InputError: if it is not such a list."""
     try:
         found = [int(part) for part in value.split(",") if part.strip()]
     except ValueError:

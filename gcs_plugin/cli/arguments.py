@@ -1,11 +1,14 @@
-"""What verbs have in common: arguments that fill a dataclass, `--config`, refusing to write over what was read."""
+"""What verbs have in common: arguments that fill a dataclass, `--config`, files to be kept, progress bars."""
 
 import argparse
 import os
+import sys
+import time
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Final
 
 from orthoswarm.model.errors import InputError
 from orthoswarm.stores.addresses import address_of, is_stored
@@ -64,11 +67,7 @@ def require_folder_for(flag: str, target: Path) -> None:
 
 
 def require_no_file(flag: str, folder: Path) -> None:
-    """Refuse a folder for products that is a file, or lies below one.
-
-    Raises:
-        InputError: it is.
-    """
+    """Refuse a folder for products that is a file, or lies below one; raises InputError: it is."""
     blocked = next((p for p in (folder, *folder.parents) if p.exists() and not p.is_dir()), None)
     if blocked is not None:
         raise InputError(f"{flag} {folder}: {blocked} is a file; choose a folder")
@@ -83,3 +82,53 @@ def given(args: argparse.Namespace, options: type[Any]) -> dict[str, Any]:
     """The arguments that are fields of a dataclass; without those that were not given, for which it has defaults."""
     values = {field.name: getattr(args, field.name, None) for field in fields(options)}
     return {name: value for name, value in values.items() if value is not None}
+
+
+_LINE_S: Final = 5.0
+
+
+class ProgressBars:
+    """One bar per stage; call it with stage, number done and total."""
+
+    def __init__(self) -> None:
+        self._bars: Any = None
+        self._tasks: dict[str, Any] = {}
+        self._shown = time.monotonic()
+
+    def __enter__(self) -> "ProgressBars":
+        if sys.stderr.isatty():
+            from rich.console import Console
+            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+            self._bars = Progress(
+                TextColumn("{task.description:<24}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeRemainingColumn(elapsed_when_finished=True),
+                console=Console(stderr=True),
+                auto_refresh=False,  # its thread would keep workers from being forked, see cheapest_context
+            )
+            self._bars.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, at: TracebackType | None) -> None:
+        if self._bars is not None:
+            self._bars.stop()
+
+    def __call__(self, what: str, done: int, total: int) -> None:
+        """Show progress."""
+        now = time.monotonic()
+        if self._bars is None:
+            if done >= total > 0 and what not in self._tasks:
+                self._tasks[what] = True
+                print(f"{what}: {total}", file=sys.stderr, flush=True)
+            elif done < total and now - self._shown > _LINE_S:
+                self._shown = now
+                print(f"{what}: {done} of {total}", file=sys.stderr, flush=True)
+            return
+        if what not in self._tasks:
+            self._tasks[what] = self._bars.add_task(what, total=total)
+        elif now - self._shown < 0.1 and done < total:
+            return
+        self._shown = now
+        self._bars.update(self._tasks[what], completed=done, total=total, refresh=True)

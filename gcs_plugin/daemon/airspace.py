@@ -100,11 +100,7 @@ _DEGE7: Final = 1e-7
 
 
 class Traffic:
-    """The recently received aircraft, each once, from any vehicle; any thread.
-
-    Args:
-        clock: monotonic seconds.
-    """
+    """The recently received aircraft, each once, from any vehicle; any thread; `clock`: monotonic seconds."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock, self._lock = clock, threading.Lock()

@@ -7,67 +7,52 @@ Parts are made in an order in which each needs only those before it. What happen
 import contextlib
 import logging
 import math
+import os
 import threading
 import time
+from pathlib import Path
 from typing import Any, Final
 
 from gcs_plugin.daemon.airspace import TerrainData
-from gcs_plugin.daemon.changes import GroundChanges
-from gcs_plugin.daemon.exports import Exports, TakFeed
+from gcs_plugin.daemon.exports import Exports, GroundChanges, TakFeed
 from gcs_plugin.daemon.flight_coverage.exposure_journal import MESSAGES as EVENT_MESSAGES
 from gcs_plugin.daemon.flight_coverage.exposure_journal import EventRequests, ExposureJournal
 from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage
 from gcs_plugin.daemon.flight_coverage.picture_requests import FetchedPictures, PictureRequests
 from gcs_plugin.daemon.flight_coverage.picture_views import PictureViews
-from gcs_plugin.daemon.gap_flights import GapFlights
-from gcs_plugin.daemon.getting_ready import GettingReady
 from gcs_plugin.daemon.intake.can_reader import CanReader
 from gcs_plugin.daemon.intake.picture_intake import PictureIntake, RefusedPictures, VehicleIntake
 from gcs_plugin.daemon.intake.picture_sources import PictureSource
-from gcs_plugin.daemon.jobs.job_queue import JobRequests, Jobs
+from gcs_plugin.daemon.jobs.job_queue import JobRequests, Jobs, LegWatch
 from gcs_plugin.daemon.jobs.leg_placement import LegPlacement
-from gcs_plugin.daemon.jobs.leg_watch import LegWatch
 from gcs_plugin.daemon.jobs.neighbours import JointRefinement, ToneBalance
 from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.sortie_refinement import SortieRefinement
-from gcs_plugin.daemon.jobs.worker_pool import LAST, WorkerPool
+from gcs_plugin.daemon.jobs.worker_pool import LAST, GettingReady, WorkerPool
 from gcs_plugin.daemon.jobs.workspace_products import RunFacts
 from gcs_plugin.daemon.layers.layers import NAMES, MapLayer
 from gcs_plugin.daemon.layers.map_site import ExpectedPlace, MapSite
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.layers.web_tiles import TileServer
-from gcs_plugin.daemon.pilots import Pilots
 from gcs_plugin.daemon.settings import Settings
+from gcs_plugin.daemon.store import daemon_events as happened
 from gcs_plugin.daemon.store.console_state import ConsoleState
-from gcs_plugin.daemon.store.daemon_events import (
-    AreaChanged,
-    CardRead,
-    DrawingRestarted,
-    Events,
-    FirstPicturesCame,
-    JobEnded,
-    LayerPublished,
-    LegsOver,
-    MissionNoted,
-    PictureDrawn,
-    PictureRejected,
-    PictureStored,
-    VehicleLookedFor,
-    VehicleSilent,
-)
-from gcs_plugin.daemon.store.journal import Journal
-from gcs_plugin.daemon.store.people_rows import People
+from gcs_plugin.daemon.store.daemon_events import Events
+from gcs_plugin.daemon.store.journal import Journal, all_changes, drawn_forgotten, fact_change, statement
+from gcs_plugin.daemon.store.people_rows import People, Pilots
 from gcs_plugin.daemon.store.picture_store import KeptPictures, PictureStore
-from gcs_plugin.daemon.store.workspace_lock import distrust_after_power_cut, take_over
 from gcs_plugin.daemon.takeoffs import Takeoffs
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.views import Views
-from gcs_plugin.daemon.web_plans import Plans
+from gcs_plugin.daemon.web_plans import GapFlights, Plans
+from orthoswarm.batch.workspace import Workspace
 from orthoswarm.compute.workers import prepare_process
+from orthoswarm.model.errors import InputError
 from telemetry.live.live_poses import LinkPoses
 
-_FEW: Final = 10  # posted pictures of a vehicle, after which the kernels of a refinement are compiled
+_FEW: Final = 10  # posted pictures of a vehicle, after which the process for background jobs is started
 _SOURCES_S: Final = 1.0
+_LOCK_S: Final = 5.0
 _log = logging.getLogger(__name__)
 
 
@@ -94,7 +79,7 @@ class Daemon:
             self._open_jobs()
             self._subscribe()
             if self.drawer.area is not None:
-                self.events.publish(AreaChanged(self.drawer.area.epsg))
+                self.events.publish(happened.AreaChanged(self.drawer.area.epsg))
             undone.pop_all()
 
     def _open_records(self) -> None:
@@ -152,7 +137,7 @@ class Daemon:
         fov_rad = None if settings.fov_min_deg is None else math.radians(settings.fov_min_deg)
         site = MapSite(
             self.journal, self.layers["realtime"], canvases, gsd_m=settings.gsd_m, fov_rad=fov_rad,
-            expected=ExpectedPlace(self.tiles, self.plans), events=self.events,
+            expected=ExpectedPlace(self.tiles, self.plans.newest_bounds), events=self.events,
             memory_mb=settings.config.compute.live_canvas_mb,
         )  # fmt: skip
         live = settings.basemap if settings.coarse else None
@@ -160,8 +145,8 @@ class Daemon:
         self.leg_watch = LegWatch(self.events, silent_s=settings.silent_s)
         self.coverage = LiveCoverage(
             self.journal, self.events, views=PictureViews(self.journal, self.store, folder / "solutions", fov_rad),
-            console=self.console, plans=self.plans.folder, drawer=self.drawer, vehicles=self.links,
-            exposures=self.exposures,
+            console=self.console, plans=self.plans.folder, drawer=self.drawer,
+            on_links=lambda: self.links.latest, exposures=self.exposures,
         )  # fmt: skip
         self.gap_flights = GapFlights(self.coverage, self.plans, self.links)
         fetched = FetchedPictures(
@@ -207,27 +192,26 @@ class Daemon:
     def _subscribe(self) -> None:
         """Who hears what, in this order, in the thread of the part that tells it."""
         on = self.events.on
-        on(PictureStored, self.drawer.picture_stored)  # told by: PictureIntake
-        on(PictureStored, self.leg_watch.picture_stored)
-        on(PictureStored, self._warm_up)
-        on(PictureDrawn, self.coverage.picture_drawn)  # Drawer
-        on(PictureRejected, self.refused.picture_rejected)
-        on(AreaChanged, self.tiles.area_changed)  # MapSite
-        on(DrawingRestarted, self.drawer.draw_anew)
-        on(FirstPicturesCame, self.requests.first_pictures_came)  # Drawer
-        on(VehicleLookedFor, self.drawer.vehicle_looked_for)  # LegPlacement
-        on(LegsOver, self.requests.legs_over)  # LegWatch
-        on(VehicleSilent, self.requests.vehicle_silent)
-        on(CardRead, self.requests.card_read)  # VehicleIntake
-        on(MissionNoted, self.requests.mission_noted)  # VehicleLinks
-        on(LayerPublished, self.coverage.look)  # Publisher
-        on(JobEnded, self.links.job_ended)  # Jobs
-        on(JobEnded, self.requests.job_ended)
+        on(happened.PictureStored, self.drawer.picture_stored)  # told by: PictureIntake
+        on(happened.PictureStored, self.leg_watch.picture_stored)
+        on(happened.PictureStored, self._warm_up)
+        on(happened.PictureDrawn, self.coverage.picture_drawn)  # Drawer
+        on(happened.PictureRejected, self.refused.picture_rejected)
+        on(happened.AreaChanged, self.tiles.area_changed)  # MapSite
+        on(happened.DrawingRestarted, self.drawer.draw_anew)
+        on(happened.FirstPicturesCame, self.requests.first_pictures_came)  # Drawer
+        on(happened.VehicleLookedFor, self.drawer.vehicle_looked_for)  # LegPlacement
+        on(happened.LegsOver, self.requests.legs_over)  # LegWatch
+        on(happened.VehicleSilent, self.requests.vehicle_silent)
+        on(happened.CardRead, self.requests.card_read)  # VehicleIntake
+        on(happened.MissionNoted, self.requests.mission_noted)  # VehicleLinks
+        on(happened.LayerPublished, self.coverage.look)  # Publisher
+        on(happened.JobEnded, self.links.job_ended)  # Jobs
+        on(happened.JobEnded, self.requests.job_ended)
 
-    def _warm_up(self, event: PictureStored) -> None:
-        """Have the kernels of a refinement compiled, as one is to come."""
+    def _warm_up(self, event: happened.PictureStored) -> None:
+        """Start the process of what is done in the background, as a vehicle is soon to be looked for on the map."""
         if event.count == _FEW:
-            self.workers.warm_kernels()
             self.background.warm_up()
 
     def start(self) -> None:
@@ -279,3 +263,50 @@ class Daemon:
         own = (self.drawer.problem, self.drawer.overload, self.jobs.problem, self.tak.problem)
         inputs = (*self.links.fleet.problems(), *self.refused.problems(), *(s.problem for s in self.sources))
         return [text for text in (self.getting_ready.problem, *own, *inputs) if text]
+
+
+def take_over(workspace: Path) -> Workspace:
+    """Take the workspace's lock, waiting for a daemon that is just ending.
+
+    The folder becomes accessible to its owner only, as it contains the token, pictures, and positions.
+
+    Raises:
+        InputError: another daemon holds it.
+    """
+    end = time.monotonic() + _LOCK_S
+    while True:
+        try:
+            lock = Workspace(workspace)
+            with contextlib.suppress(OSError):  # another user's folder, or a file system without permissions
+                workspace.chmod(0o700)
+            return lock
+        except InputError:
+            if workspace.is_file() or time.monotonic() > end:
+                raise
+            time.sleep(0.1)
+
+
+def distrust_after_power_cut(journal: Journal) -> bool:
+    """After a power cut, have the real-time layer drawn again, as its last pixels may be lost.
+
+    Pictures and journal are synced before they are acknowledged, solution files before they are published; canvases are
+    not, for speed.
+
+    Returns:
+        Whether canvases can be trusted.
+    """
+    boot = _boot_id()
+    clean = bool(journal.fact("clean") or journal.fact("boot") in (None, boot))
+    forgotten = () if clean else (drawn_forgotten, statement("DELETE FROM meta WHERE key = 'realtime'", ()))
+    journal.write(all_changes(fact_change("boot", boot), fact_change("clean", False), *forgotten))
+    if not clean:
+        _log.warning("the machine was switched off without a shutdown; the real-time layer is drawn again")
+    return clean
+
+
+def _boot_id() -> str:
+    """Identifies this boot of the machine."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:
+        return str(round((time.time() - time.monotonic()) / 60.0)) if os.name == "nt" else ""

@@ -1,4 +1,7 @@
-"""Exports of the workspace, its finds and vehicles as places (for TAK programs, too), and which pictures show one."""
+"""Exports of the workspace; finds and vehicles as places (for TAK programs, too); pictures that show one; changes.
+
+What changed since the basemap is found after an export, in the background.
+"""
 
 import contextlib
 import logging
@@ -8,8 +11,9 @@ import shutil
 import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final, TypedDict
 
@@ -37,6 +41,7 @@ from gcs_plugin.daemon.store.picture_store import PictureStore
 from gcs_plugin.daemon.store.sortie_rows import coarse_only, placed_sorties
 from gcs_plugin.daemon.vehicle_names import VehicleRow
 from gcs_plugin.daemon.views import Views
+from orthoswarm.change.change_files import FIGURES, change_overlay, figures_in
 from orthoswarm.export.atomic_file import atomic_write, write_file
 from orthoswarm.export.tactical.cursor_on_target import TakAddress, TakSender, event
 from orthoswarm.export.tactical.places import Place, sightings
@@ -135,7 +140,9 @@ class Exports:
                 for find in self._console.finds()
             ]
             places = tuple(self.places(shown))
-            task = replace(task, facts=self._report_facts(), places=places, cells=self._coverage.png)
+            covered = self._coverage.result.document
+            facts = self._facts.document() | ({} if covered["state"] == "no area" else {"coverage": covered})
+            task = replace(task, facts=facts, places=places, cells=self._coverage.result.png)
             if "pack" in task.formats:
                 write_file(self._settings.workspace / "log.csv", self._people.table())
             job.detail["files"] = files = run.run(write_products, task)
@@ -163,11 +170,7 @@ class Exports:
         return rows
 
     def picture(self, seq: int) -> Path:
-        """The file of a picture.
-
-        Raises:
-            InputError: there is no such picture.
-        """
+        """The file of a picture; raises InputError: there is no such picture."""
         name = frame_path(self._journal, seq)
         if name is None or not self._store.path(name).is_file():
             raise InputError(f"there is no picture {seq}; see /api/frames")
@@ -185,10 +188,6 @@ class Exports:
         import simplejpeg
 
         return bytes(simplejpeg.encode_jpeg(picture_file.read_rgb(path), _VIEW_QUALITY, "RGB"))
-
-    def _report_facts(self) -> dict[str, Any]:
-        covered = self._coverage.document
-        return self._facts.document() | ({} if covered["state"] == "no area" else {"coverage": covered})
 
     def _task(self, area: MapArea) -> ExportTask:
         """The export task of the workspace, without layers and formats."""
@@ -307,3 +306,72 @@ def _sent(sender: TakSender, events: Sequence[bytes]) -> str:
     except OrthoSwarmError as error:
         return str(error)
     return ""
+
+
+@dataclass(frozen=True, slots=True)
+class ChangeTask:
+    """What is compared: a workspace and its basemap; `pictures`: (vehicle, image) -> file."""
+
+    workspace: Path
+    basemap: Path
+    pictures: Mapping[tuple[str, str], Path]
+
+
+def find_change(task: ChangeTask) -> dict[str, Any]:
+    """Compare the products of a workspace with its basemap; returns the shares."""
+    from orthoswarm.change.of_folder import change_of
+    from orthoswarm.report.page import put_section
+
+    figures = change_of(
+        task.workspace, task.workspace, basemap=task.basemap,
+        find=lambda vehicle, image: task.pictures.get((vehicle, image)),
+    )  # fmt: skip
+    put_section(task.workspace, task.workspace)
+    return {key: figures[key] for key in ("changed_share", "not_visible_share", "count", "warnings")}
+
+
+class GroundChanges:
+    """Does the jobs `change`, and answers the page."""
+
+    def __init__(self, settings: Settings, journal: Journal, store: PictureStore) -> None:
+        self._settings, self._journal, self._store = settings, journal, store
+
+    def find(self, run: RunningJob) -> Change:
+        """The handler of a `change` job."""
+        workspace, basemap = self._settings.workspace, self._settings.basemap
+        if basemap is None or not (workspace / "orthoimage.tif").exists():
+            run.job.detail["note"] = "nothing is refined on a basemap"
+            return no_change
+        compared = workspace / FIGURES
+        if compared.exists() and compared.stat().st_mtime_ns >= (workspace / "orthoimage.tif").stat().st_mtime_ns:
+            run.job.detail["note"] = "the last one has everything"
+            return no_change
+        run.report(0.1, "comparing with the basemap")
+        pictures = {
+            (writable(row.vehicle), writable(row.image)): self._store.path(row.path)
+            for row in all_frames(self._journal)
+        }
+        run.job.detail |= run.run(find_change, ChangeTask(workspace, basemap, pictures))
+        return no_change
+
+    def document(self) -> dict[str, Any]:
+        """The figures of the last comparison, with `version` (0: none yet) and the `corners` of its picture."""
+        version, figures = self._version(), figures_in(self._settings.workspace)
+        if not version or figures is None:
+            return {"version": 0, "objects": [], "corners": None}
+        return figures | {"version": version, "corners": _overlay(self._settings.workspace, version, 0.5)[1]}
+
+    def picture(self, threshold: float) -> tuple[bytes, int] | None:
+        """The overlay from a probability on, PNG, and its version; None if nothing was compared yet."""
+        version = self._version()
+        return (_overlay(self._settings.workspace, version, threshold)[0], version) if version else None
+
+    def _version(self) -> int:
+        path = self._settings.workspace / FIGURES
+        return path.stat().st_mtime_ns // 1_000_000 if path.is_file() else 0
+
+
+@lru_cache(maxsize=8)
+def _overlay(workspace: Path, _version: int, threshold: float) -> tuple[bytes, list[list[float]]]:
+    """See change_overlay: computed once a version and threshold, for all pages."""
+    return change_overlay(workspace, threshold)

@@ -130,19 +130,11 @@ class Settings:
         return {vehicle: system for vehicle, system in known.items() if system is not None}
 
     def tak_address(self, text: str) -> TakAddress:
-        """A receiver of Cursor-on-Target events.
-
-        Raises:
-            InputError: it is not an address.
-        """
+        """A receiver of Cursor-on-Target events; raises InputError: it is not an address."""
         return TakAddress.parse(text, self.tak_certificate, self.tak_authority)
 
     def check(self) -> "Settings":
-        """Check the values; returns itself.
-
-        Raises:
-            InputError: a value is invalid.
-        """
+        """Check the values; returns itself; raises InputError: a value is invalid."""
         if not 0 <= self.port <= 65535:
             raise InputError(f"port {self.port} is not a port; give 1 to 65535, or 0 for any free one")
         if (self.certificate is None) != (self.key is None):

@@ -155,11 +155,7 @@ class Takeoffs:
             self.waiting.condition.notify_all()
 
     def _still_wanted(self, given_s: float, stops: Mapping[int, int]) -> None:
-        """Make sure that nobody told a vehicle to stop during the check, and that this did not take too long.
-
-        Raises:
-            OrthoSwarmError: the start is void.
-        """
+        """Make sure that nobody told a vehicle to stop during the check, and that this did not take too long."""
         told = [s for s in sorted(self.waiting.checking) if self._links.fleet.stops.get(s, 0) != stops.get(s, 0)]
         if told:
             who = ", ".join(self._links.names.name_of(system) for system in told)
@@ -172,17 +168,9 @@ class Takeoffs:
             )
 
     def _ready(
-        self,
-        plan: str,
-        sortie: int,
-        names: Mapping[str, str] | None,
-        override: Mapping[str, Collection[str]],
+        self, plan: str, sortie: int, names: Mapping[str, str] | None, override: Mapping[str, Collection[str]]
     ) -> dict[str, Mission]:
-        """Check the plan's vehicles; returns its missions by vehicle.
-
-        Raises:
-            OrthoSwarmError: not all have passed.
-        """
+        """Check the plan's vehicles; returns its missions by vehicle; raises OrthoSwarmError: not all have passed."""
         rows, missions = self._check(plan, sortie, names)
         wrong = [
             f"{row['vehicle']}: {text}" for row in rows for text in red_items(row, override.get(row["vehicle"], ()))
@@ -283,11 +271,7 @@ def _none_started() -> Iterator[None]:
 
 
 def names_of(body: Mapping[str, Any]) -> tuple[int, dict[str, str]]:
-    """The flight's number and the vehicles' names in a request.
-
-    Raises:
-        InputError: they are invalid.
-    """
+    """The flight's number and the vehicles' names in a request; raises InputError: they are invalid."""
     sortie, names = body.get("sortie", 1), body.get("vehicles", {})
     if isinstance(sortie, bool) or not isinstance(sortie, int) or sortie < 1:
         raise InputError("sortie is not a number from 1; send one, or nothing for the first")

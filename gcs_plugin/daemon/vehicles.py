@@ -21,32 +21,17 @@ from typing import Any, Final, cast
 from gcs_plugin.daemon.airspace import Fences, Traffic
 from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.start_checks import CheckRow, StartChecks, WaitingTakeoffs, red_items
-from gcs_plugin.daemon.store.daemon_events import (
-    CommandDone,
-    CompletionRefined,
-    Events,
-    JobEnded,
-    MissionNoted,
-    TrafficChanged,
-    VehicleChanged,
-    VehicleReported,
-)
+from gcs_plugin.daemon.store import sortie_rows
+from gcs_plugin.daemon.store.daemon_events import Events, JobEnded, MissionNoted
 from gcs_plugin.daemon.store.frame_rows import exposure_times
 from gcs_plugin.daemon.store.journal import Journal
-from gcs_plugin.daemon.store.sortie_rows import (
-    completion_refined,
-    mission_noted,
-    sortie_given_up,
-    vehicle_found,
-    vehicle_state,
-)
 from gcs_plugin.daemon.vehicle_names import VehicleRow
 from gcs_plugin.fleet.commands import URGENT, VERBS, CommandResult, Order, Verb, new_id
 from gcs_plugin.fleet.fence_limits import FenceLimits, fence_limits
 from gcs_plugin.fleet.fleet import Fleet
-from gcs_plugin.fleet.fleet_events import FleetEvent
 from gcs_plugin.fleet.flight_state import summary
 from gcs_plugin.fleet.preflight import CONTINUED, ITEMS
+from gcs_plugin.fleet.reception import FleetEvent
 from gcs_plugin.fleet.separation.returns import Returns
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot
@@ -399,11 +384,11 @@ class VehicleLinks:
             "version": job.detail["version"], "frames": job.detail["frames"],
             "still_flying_after": [r["id"] for r in self.rows() if r["mission"]["phase"] == "active"],
         }  # fmt: skip
-        self._journal.write(completion_refined(job.whose, facts))
-        self._events.publish(CompletionRefined({"vehicle": job.vehicle, "sortie": job.sortie, **facts}))
+        self._journal.write(sortie_rows.completion_refined(job.whose, facts))
+        self._events.tell("completion", vehicle=job.vehicle, sortie=job.sortie, **facts)
 
     def _told(self, row: dict[str, Any]) -> None:
-        self._events.publish(CommandDone(row))
+        self._events.tell("command", **row)
 
     # -- what vehicles say (in the fleet's thread) ------------------------------------------------------------------
 
@@ -431,7 +416,7 @@ class VehicleLinks:
                     if s != event.system and (v.detector.phase is Phase.ACTIVE or v.flying) and not v.lost
                 ]
                 completion = {"complete_s": event.time_s, "still_flying": flying}
-                self._journal.write(mission_noted(name, event.kind, vehicle.detector.state(), completion))
+                self._journal.write(sortie_rows.mission_noted(name, event.kind, vehicle.detector.state(), completion))
                 self._events.publish(MissionNoted(name, event.kind))
         except OrthoSwarmError as error:  # the disk is full: flying goes on
             _log.error("%s", error)
@@ -445,17 +430,17 @@ class VehicleLinks:
         grave = event.kind == "danger" or event.severity <= _FAULT
         if grave or event.kind != "text":
             _log.log(logging.WARNING if grave else logging.INFO, "%s", text)
-        self._events.publish(VehicleReported(about))
+        self._events.tell("vehicle_event", **about)
 
     def _found(self, vehicle: Vehicle, name: str) -> None:
         """Record a detected vehicle; its detector continues from the state stored by an earlier daemon."""
-        detector = vehicle_state(self._journal, name).get("detector")
+        detector = sortie_rows.vehicle_state(self._journal, name).get("detector")
         if detector and detector.get("autopilot") == vehicle.autopilot.value:
             try:
                 vehicle.detector = CompletionDetector.from_state(detector)
             except (KeyError, TypeError, ValueError):  # of another version
                 _log.warning("%s: what was known about its mission cannot be read", name)
-        self._journal.write(vehicle_found(name))
+        self._journal.write(sortie_rows.vehicle_found(name))
 
     # -- what time asks for -----------------------------------------------------------------------------------------
 
@@ -467,7 +452,7 @@ class VehicleLinks:
                 self.fleet.call(self._fences.look).result(_SOON_S)
                 self._publish_rows(complete=number % _COMPLETE_EVERY == 0)
                 if self.traffic.changed():
-                    self._events.publish(TrafficChanged(self.traffic.rows()))
+                    self._events.tell("traffic", rows=self.traffic.rows())
                 self._give_up_silent()
             except Exception as error:  # an unexpected state of one vehicle must not end the watch
                 _log.warning("watching vehicles: %s", str(error) or type(error).__name__)
@@ -484,7 +469,7 @@ class VehicleLinks:
             fresh = now if complete else {k: v for k, v in now.items() if k not in sent or sent[k] != v}
             sent.update(now)
             always = {"id": row["id"], "name": row["name"], "silent_s": row["silent_s"]}
-            self._events.publish(VehicleChanged(fresh | always))
+            self._events.tell("vehicle", **fresh | always)
 
     def _give_up_silent(self) -> None:
         """Refine the incomplete sortie of a vehicle that has been silent for long during its mission."""
@@ -495,7 +480,7 @@ class VehicleLinks:
                 continue
             if vehicle.detector.phase not in (Phase.ACTIVE, Phase.SUSPENDED):
                 continue
-            given_up = self._journal.write(sortie_given_up(record.id))
+            given_up = self._journal.write(sortie_rows.sortie_given_up(record.id))
             record.lost_since = None  # after that: if the disk is full, it is tried again
             if given_up:
                 _log.info("%s has been silent for long; what it sent is refined", record.id)

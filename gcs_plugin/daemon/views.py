@@ -13,23 +13,10 @@ from gcs_plugin.daemon.intake.picture_sources import PictureSource
 from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.layers.layers import drawn_bounds
 from gcs_plugin.daemon.layers.web_tiles import TileServer
-from gcs_plugin.daemon.store.frame_rows import (
-    POSE_KEYS,
-    FrameRow,
-    Whose,
-    arrived_frames,
-    newest_frames,
-    unplaced_frames,
-)
+from gcs_plugin.daemon.store import frame_rows, sortie_rows
+from gcs_plugin.daemon.store.frame_rows import POSE_KEYS, FrameRow, Whose
 from gcs_plugin.daemon.store.journal import Journal
-from gcs_plugin.daemon.store.sortie_rows import (
-    REFINED,
-    coarse_only,
-    completion_rows,
-    placed_sorties,
-    senders,
-    solution_paths,
-)
+from gcs_plugin.daemon.store.sortie_rows import REFINED
 from gcs_plugin.daemon.vehicle_names import VehicleRow
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from orthoswarm.export.product_files import frame_row, iso_time
@@ -54,18 +41,13 @@ class Views:
         self._sources, self._buses, self._poses, self._solutions = sources, buses, poses, solutions
 
     def frames(
-        self,
-        vehicle: str | None = None,
-        since: float | None = None,
-        limit: int | None = None,
-        *,
-        poses: bool = False,
+        self, vehicle: str | None = None, since: float | None = None, limit: int | None = None, *, poses: bool = False
     ) -> list[dict[str, Any]]:
         """Frames in the order of arrival, those that were taken at a time (UTC epoch seconds) or later.
 
         poses: with their grid and homography, see `POSE_KEYS`.
         """
-        rows = arrived_frames(self._journal, vehicle, since, limit)
+        rows = frame_rows.arrived_frames(self._journal, vehicle, since, limit)
         if not poses:
             return [_frame(row) for row in rows]
         refined = self._refined_poses({(row.vehicle, row.sortie) for row in rows if row.stage in REFINED})
@@ -75,7 +57,7 @@ class Views:
         """What `POSE_KEYS` names, of the refined frames of sorties, by vehicle and image."""
         poses: dict[tuple[str, str], dict[str, Any]] = {}
         area = self._journal.fact("area")
-        for whose, path in solution_paths(self._journal, "coarse", "solutions").items() if area else ():
+        for whose, path in sortie_rows.solution_paths(self._journal, "coarse", "solutions").items() if area else ():
             if whose not in wanted:
                 continue
             solution = read_solution(self._solutions / path).solution
@@ -102,7 +84,7 @@ class Views:
 
     def _senders(self) -> Iterable[VehicleRow]:
         """Vehicles in the journal, with their counts of frames and where the last picture was taken."""
-        found, newest = senders(self._journal), newest_frames(self._journal)
+        found, newest = sortie_rows.senders(self._journal), frame_rows.newest_frames(self._journal)
         for sender in found:
             document: VehicleRow = {"id": sender.vehicle, "state": "pictures", "sortie": sender.sortie}
             document["frames"], document["last_seq"] = sender.frames, sender.last
@@ -116,9 +98,9 @@ class Views:
 
     def legs(self) -> dict[str, Any]:
         """The legs as GeoJSON lines with state, confidence, sigma and stage: coarse in flight, fine once refined."""
-        refined = [("fine", row) for row in placed_sorties(self._journal, "solutions")]
+        refined = [("fine", row) for row in sortie_rows.placed_sorties(self._journal, "solutions")]
         features = []
-        for stage, row in refined + [("coarse", row) for row in coarse_only(self._journal)]:
+        for stage, row in refined + [("coarse", row) for row in sortie_rows.coarse_only(self._journal)]:
             legs = [leg for leg in row.detail["legs"] if leg.get("line")]
             for number, leg in enumerate(legs, start=1):
                 about = {"vehicle": row.vehicle, "sortie": row.sortie, "leg": number, "stage": stage}
@@ -126,12 +108,12 @@ class Views:
                 geometry = {"type": "LineString", "coordinates": leg["line"]}
                 features.append({"type": "Feature", "properties": about, "geometry": geometry})
         shown = {row.whose for _, row in refined}
-        live = [] if self._tiles.basemap is None else unplaced_frames(self._journal, _MOST_LIVE)
+        live = [] if self._tiles.basemap is None else frame_rows.unplaced_frames(self._journal, _MOST_LIVE)
         return {"type": "FeatureCollection", "features": features + _live_legs(live[::-1], shown)}
 
     def completions(self) -> list[dict[str, Any]]:
         """Completions of vehicles and their results."""
-        return completion_rows(self._journal)
+        return sortie_rows.completion_rows(self._journal)
 
     def layers(self) -> list[dict[str, Any]]:
         """The layers with versions and bounds, the basemap first, `best` last."""

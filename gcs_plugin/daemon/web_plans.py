@@ -1,4 +1,7 @@
-"""Plans made over HTTP: one folder each in the workspace, with the files of `orthoswarm plan`."""
+"""Plans made over HTTP: one folder each in the workspace, with the files of `orthoswarm plan`; flights over gaps, too.
+
+Flights over missed ground are planned from the gaps of the coverage, uploaded and started by the operator.
+"""
 
 import contextlib
 import io
@@ -12,9 +15,13 @@ from contextlib import closing
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final, TypedDict
 
+from gcs_plugin.config import LIMITS
+from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
+from gcs_plugin.daemon.vehicle_names import VehicleRow
+from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.geofence import FenceZone
 from gcs_plugin.mission.items import Mission
@@ -22,11 +29,12 @@ from gcs_plugin.mission.makers.maker_files import MAKERS, maker_file, read_missi
 from gcs_plugin.mission.mission_builder import build_mission, read_mission
 from gcs_plugin.mission.mission_files import parse_mission
 from gcs_plugin.mission.plan_folder import PlanNeeds, plan_needs
-from gcs_plugin.plans.no_fly import read_zones, refuse_no_zones
+from gcs_plugin.plans.area_files import read_zones, refuse_no_zones
 from gcs_plugin.plans.plan_files import write_plan
 from gcs_plugin.plans.plan_request import AUTOPILOTS, ENDS, METHODS, RELIEFS, PlanRequest, make_plan
 from orthoswarm.config import DEFAULT, Config
-from orthoswarm.model.errors import InputError
+from orthoswarm.model.earth import distance_m
+from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.planning.area.shape_files import parse_geojson
 
 _NAME: Final = re.compile(r"[0-9a-z][0-9a-z-]{0,63}\Z")
@@ -46,16 +54,6 @@ Place = tuple[float, float]
 """Latitude and longitude in degrees."""
 
 
-class PlannedVehicles(Protocol):
-    """The vehicles on the links."""
-
-    def autopilots(self) -> Mapping[str, str]:
-        """The autopilot of each, by id."""
-
-    def standing(self) -> Mapping[str, Place | str]:
-        """Where each stands, or why that is not known, in words."""
-
-
 class Plans:
     """The plans of a workspace.
 
@@ -64,7 +62,7 @@ class Plans:
         vehicles: on the links; a plan is made for these unless its request names others. config: margins and times.
     """
 
-    def __init__(self, folder: Path, dem: Path | None, vehicles: PlannedVehicles, config: Config = DEFAULT) -> None:
+    def __init__(self, folder: Path, dem: Path | None, vehicles: VehicleLinks, config: Config = DEFAULT) -> None:
         self.folder, self.dem, self._vehicles, self._config = folder, dem, vehicles, config
         self._bounds: tuple[Path, GeographicBounds] | None = None
 
@@ -155,11 +153,7 @@ class Plans:
         return found
 
     def geojson(self, name: str) -> bytes:
-        """A plan as GeoJSON.
-
-        Raises:
-            InputError: there is no such plan.
-        """
+        """A plan as GeoJSON; raises InputError: there is no such plan."""
         return (self._path(name) / "all.geojson").read_bytes()
 
     def maker_files(self, name: str, drone: str) -> bytes:
@@ -243,11 +237,7 @@ class Plans:
         return {vehicle["id"]: vehicle["flights"] for vehicle in figures["vehicles"]}
 
     def needs(self, name: Any) -> PlanNeeds:
-        """What a plan relies on.
-
-        Raises:
-            InputError: there is no such plan.
-        """
+        """What a plan relies on; raises InputError: there is no such plan."""
         return plan_needs(self._path(name))
 
     def newest_bounds(self) -> GeographicBounds | None:
@@ -268,11 +258,7 @@ class Plans:
 
 
 def _zones(no_fly: Any) -> Mapping[str, Any] | None:
-    """The no-fly zones of a request, None if it has none: any GeoJSON, of which nothing is left out without a word.
-
-    Raises:
-        InputError: it is not GeoJSON, or holds something that no vehicle could be kept out of.
-    """
+    """The no-fly zones of a request, None if it has none: any GeoJSON, of which nothing is left out without a word."""
     if no_fly is None:
         return None
     if not isinstance(no_fly, dict):
@@ -283,11 +269,7 @@ def _zones(no_fly: Any) -> Mapping[str, Any] | None:
 
 
 def _values(body: Mapping[str, Any]) -> dict[str, Any]:
-    """The request's values as fields of a PlanRequest.
-
-    Raises:
-        InputError: one is missing or invalid.
-    """
+    """The request's values as fields of a PlanRequest; raises InputError: one is missing or invalid."""
     count = body.get("vehicles")
     if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= 250:
         raise InputError("vehicles is missing; send a number from 1 to 250")
@@ -322,11 +304,7 @@ def _values(body: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _autopilots(value: Any) -> list[str]:
-    """One autopilot for all vehicles, or a list that they are given in turn.
-
-    Raises:
-        InputError: there is no such autopilot.
-    """
+    """One autopilot for all vehicles, or a list that they are given in turn."""
     names = value if isinstance(value, list) else [value]
     if not names or not all(isinstance(name, str) and name in AUTOPILOTS for name in names):
         raise InputError(f"autopilot is none of {', '.join(AUTOPILOTS)} and no list of these; choose one")
@@ -359,3 +337,146 @@ def plan_into(request: PlanRequest, notes: Sequence[str]) -> dict[str, Any]:
     """Plan in a worker and write the plan's folder; returns the figures, with notes before the plan's warnings."""
     plan, area = make_plan(request)
     return write_plan(request.area.parent, plan, area, request, notes=notes, picture=False)
+
+
+_LONGEST_MIN: Final = 600.0
+_ON_ITS_WAY: Final = frozenset({"on mission", "paused", "holding", "flying"})
+_HOME_M_S: Final = 5.0
+"""A plan ends where a vehicle in the air began it; from there it still flies home, at least so fast."""
+
+
+class GapFlyer(TypedDict):
+    """A vehicle that could fly over gaps, see `GapFlights.vehicles`."""
+
+    id: str
+    battery: float | None
+    minutes: float | None
+    busy: str
+    in_air: bool
+    lat_deg: float | None
+    lon_deg: float | None
+    home: list[float] | None
+
+
+class GapFlights:
+    """Plans flights over gaps. Nothing is uploaded or started here."""
+
+    def __init__(self, coverage: LiveCoverage, plans: Plans, links: VehicleLinks) -> None:
+        self._coverage, self._plans, self._links = coverage, plans, links
+
+    def vehicles(self) -> list[GapFlyer]:
+        """Vehicles that could fly: `id`, `battery` (share left), `minutes` (None: unknown), `busy` (why not now).
+
+        Minutes are those until the reserve, by what the vehicle's flight so far has cost. `in_air` is true for a busy
+        one that may be given the gaps in the air, if the operator says so for this vehicle.
+        """
+        rows: list[GapFlyer] = []
+        for row in self._links.rows():
+            due = "in_s" in (row["takeoff"] or {})
+            seconds = self._coverage.battery.seconds(str(row["id"]), LIMITS.reserve_share)
+            rows.append({
+                "id": row["id"], "battery": row["battery"],
+                "minutes": None if seconds is None else round(seconds / 60.0, 1),
+                "busy": "it is about to take off; cancel that first" if due else _busy(row),
+                "in_air": self._plans.dem is None and _may_go_on(row),
+                "lat_deg": row["lat_deg"], "lon_deg": row["lon_deg"], "home": row["home"],
+            })  # fmt: skip
+        return rows
+
+    def plan(self, body: Mapping[str, Any]) -> dict[str, Any]:
+        """Plan a flight over the gaps, with what the vehicles' pictures saw from the heights that were recorded.
+
+        Args:
+            body: `vehicles` {id: minutes that it can fly, or null for what its battery says}; `altitude_m`, that of the
+                plan before unless given; `fly_not_arrived`: gaps, too, whose pictures were taken and have not arrived;
+                `in_air`: vehicles that may be given the gaps in the air: to be paused, then uploaded to and started.
+
+        Returns:
+            The plan's figures with its `id`, and `names`: the plan's vehicle -> the daemon's.
+
+        Raises:
+            InputError: a value is invalid, a battery level is unknown, or there is no gap.
+            OrthoSwarmError: a vehicle is still flying.
+        """
+        known = {row["id"]: row for row in self.vehicles()}
+        chosen = _minutes(body.get("vehicles"), known, body.get("in_air", ()))
+        fov_deg, altitude_m, notes = self._camera(list(chosen), body)
+        ordered = sorted(chosen, key=lambda vehicle: -chosen[vehicle])
+        values = {
+            "vehicles": len(ordered), "altitude_m": altitude_m, "fov_min_deg": fov_deg, "gaps": True,
+            "endurances_min": [chosen[vehicle] for vehicle in ordered],
+            "starts": [(known[v]["lat_deg"], known[v]["lon_deg"]) for v in ordered],
+            "fly_not_arrived": body.get("fly_not_arrived") is True,
+            "autopilots": self._plans.autopilots_of(ordered),
+        }  # fmt: skip
+        made = self._plans.make_in("gaps.geojson", self._coverage.result.gaps, self._coverage.no_fly, values, notes)
+        names = dict(zip([f"v{k}" for k in range(1, len(ordered) + 1)], ordered, strict=True))
+        return made | {"names": {row["id"]: names[row["id"]] for row in made["vehicles"]}}
+
+    def _camera(self, vehicles: list[str], body: Mapping[str, Any]) -> tuple[float, float, list[str]]:
+        """Field of view in degrees, altitude in metres, and notes about them."""
+        plan = self._coverage.result.document["plan"]
+        figures = {} if plan is None else json.loads((self._plans.folder / plan / "plan.json").read_text("utf-8"))
+        over = figures.get("over_ground") or {"nominal_m": figures.get("altitude_m")}
+        altitude = body.get("altitude_m", over["nominal_m"])
+        if isinstance(altitude, bool) or not isinstance(altitude, int | float) or not 1.0 <= altitude <= 10_000.0:
+            raise InputError("altitude_m is missing or not a height; send metres above takeoff, for example 80")
+        solved = self._coverage.planning_fovs_deg(heights_over_level_ground=self._plans.dem is None)
+        unknown = [vehicle for vehicle in vehicles if vehicle not in solved]
+        found = [solved[vehicle] for vehicle in vehicles if vehicle in solved]
+        notes = []
+        if unknown:
+            if not figures:
+                raise InputError(f"the lens of {', '.join(unknown)} is not known yet; wait until its legs are placed")
+            found.append(float(figures["fov_min_deg"]))
+            notes.append(f"no picture of {', '.join(unknown)} is placed: the field of view of the plan is assumed")
+        return min(found), float(altitude), notes
+
+
+def _busy(row: VehicleRow) -> str:
+    """Why a vehicle cannot be given another flight now, empty if it can."""
+    if row["state"] == "lost":
+        return "its link is lost"
+    if row["armed"]:
+        return "it is still flying; bring it home first" + (
+            ", or confirm that it gets another mission in the air" if _may_go_on(row) else ""
+        )
+    return "" if row["lat_deg"] is not None else "it has no position"
+
+
+def _may_go_on(row: VehicleRow) -> bool:
+    """Whether a vehicle is in the air in a state from which another mission can be begun."""
+    ready = row["armed"] and row["state"] == "found" and row["flight"]["state"] in _ON_ITS_WAY
+    return bool(ready and row["lat_deg"] is not None and row.get("home"))
+
+
+def _minutes(wanted: Any, known: Mapping[str, GapFlyer], in_air: Any) -> dict[str, float]:
+    """Vehicle -> minutes that it can fly; for one in the air less the way from where it is to its home."""
+    if not isinstance(in_air, list | tuple) or not all(isinstance(vehicle, str) for vehicle in in_air):
+        raise InputError('in_air is not a list of vehicles; send for example ["v1"], or nothing')
+    if not isinstance(wanted, dict) or not wanted:
+        raise InputError('vehicles is missing; send for example {"v1": null, "v2": 12}')
+    chosen = {}
+    for vehicle, requested_min in wanted.items():
+        row = known.get(vehicle)
+        if row is None:
+            raise InputError(f"{vehicle} is not on the links; see /api/coverage/vehicles")
+        goes_on = row["in_air"] and vehicle in in_air
+        if row["busy"] and not goes_on:
+            raise OrthoSwarmError(f"{vehicle} gets no other flight: {row['busy']}")
+        minutes = row["minutes"] if requested_min is None else requested_min
+        if minutes is None:
+            raise InputError(f"how long {vehicle} can fly is not known; send its minutes, no figure is assumed")
+        if isinstance(minutes, bool) or not isinstance(minutes, int | float) or not 0.0 < minutes <= _LONGEST_MIN:
+            raise InputError(f"{vehicle} cannot fly for {minutes} minutes; send a number from 1 to {_LONGEST_MIN:g}")
+        chosen[str(vehicle)] = float(minutes) - (_home_min(row) if goes_on else 0.0)
+        if chosen[str(vehicle)] <= 0.0:
+            raise InputError(f"{vehicle} cannot fly for {minutes} minutes more and come home; bring it home now")
+    return chosen
+
+
+def _home_min(row: GapFlyer) -> float:
+    """Minutes home from where a vehicle is."""
+    lat, lon, home = row["lat_deg"], row["lon_deg"], row["home"]
+    assert lat is not None and lon is not None and home is not None  # of one that may go on in the air
+    return distance_m(lat, lon, home[0], home[1]) / _HOME_M_S / 60.0

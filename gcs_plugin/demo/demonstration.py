@@ -14,7 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final
 
-from gcs_plugin.demo.setting import FOV_MIN_DEG, HEIGHT_M, DemoSetting
+from gcs_plugin.demo.simulated_camera import FOV_MIN_DEG, HEIGHT_M, DemoSetting
 from orthoswarm.compute.workers import spawn_context, starting_processes
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
@@ -160,11 +160,7 @@ def _daemon(setting: DemoSetting, out: Path, addresses: dict[str, list[str]]) ->
 
 
 class Served:
-    """The daemon's web server in a thread.
-
-    Attributes:
-        url: the page's address, with the token.
-    """
+    """The daemon's web server in a thread; `url`: the page's address, with the token."""
 
     def __init__(self, daemon: "Daemon", port: int) -> None:
         import uvicorn
@@ -267,11 +263,7 @@ def _flown(simulator: _Simulator, due_s: float) -> bool:
 
 
 def _start_vehicle(daemon: "Daemon", plan: str, vehicle: str) -> None:
-    """Upload a vehicle's mission and start it; again while the machine is too busy for that.
-
-    Raises:
-        OrthoSwarmError: it did not start.
-    """
+    """Upload a vehicle's mission and start it; again while the machine is too busy for that."""
     links = daemon.links
     system = links.fleet.system_of(vehicle)
     mission = daemon.plans.mission({"plan": plan}, vehicle, links.fleet.vehicles[system].autopilot)

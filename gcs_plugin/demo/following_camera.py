@@ -21,8 +21,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 
-from gcs_plugin.demo.setting import DemoSetting
-from gcs_plugin.demo.simulated_camera import TwinCamera, VideoSender, VideoServer
+from gcs_plugin.demo.simulated_camera import DemoSetting, TwinCamera, VideoSender, VideoServer
 from gcs_plugin.fleet.link_hub import Hub, Side
 from gcs_plugin.links.transports import Link, Peer
 from gcs_plugin.mission.exchange import Address
@@ -54,11 +53,7 @@ _WAIT_S: Final = 0.5
 
 
 class Outlet(Protocol):
-    """Destination of a vehicle's pictures.
-
-    Attributes:
-        url: its address.
-    """
+    """Destination of a vehicle's pictures; `url`: its address."""
 
     url: str
 

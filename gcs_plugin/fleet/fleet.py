@@ -18,10 +18,9 @@ from typing import Final, TypeVar
 from gcs_plugin.config import COMMAND
 from gcs_plugin.fleet.commands import URGENT, Order, Verb
 from gcs_plugin.fleet.dialogues import Dialogues, continued, resumed
-from gcs_plugin.fleet.fleet_events import FleetEvent
 from gcs_plugin.fleet.heard_messages import MESSAGE_IDS
 from gcs_plugin.fleet.link_hub import Hub
-from gcs_plugin.fleet.reception import Handler, Reception
+from gcs_plugin.fleet.reception import FleetEvent, Handler, Reception
 from gcs_plugin.fleet.separation.separation_watch import NUMBERED, VehicleNames
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot, Message
@@ -94,13 +93,7 @@ class Fleet:
         self._told_home: dict[int, float] = {}
         self._dialogues = Dialogues(self.vehicles, self.hub, clock, signed=self.signed)
         self._reception = Reception(
-            self.vehicles,
-            self.hub,
-            dialogues=self._dialogues,
-            own=own,
-            event=self._publish,
-            wall=wall,
-            names=names,
+            self.vehicles, self.hub, dialogues=self._dialogues, own=own, event=self._publish, wall=wall, names=names
         )
         self.separation = self._reception.separation
         self.takeoffs, self.names = takeoffs, names
@@ -371,11 +364,7 @@ class Fleet:
         return resumed(vehicle) if verb == "resume" else continued(vehicle)
 
     def _start(self, order: Order) -> Exchange:
-        """The dialogue of a start.
-
-        Raises:
-            OrthoSwarmError: the vehicle cannot be started, or is not what it was when the start was given.
-        """
+        """The dialogue of a start."""
         vehicle = self._flies_missions(order.system)
         if vehicle.detector.phase is Phase.ACTIVE and vehicle.armed:
             raise OrthoSwarmError(f"vehicle {order.system} is flying its mission already")

@@ -192,11 +192,7 @@ def summary(vehicle: Vehicle, now: float) -> dict[str, Any]:
         "gps_s": _old_s(vehicle.streams.age_s(MESSAGE_IDS["GPS_RAW_INT"], now)),
         "gps_fix": vehicle.gps_fix,
         "satellites": vehicle.satellites,
-        "mission": {
-            "phase": vehicle.detector.phase.value,
-            "item": vehicle.mission_seq,
-            "items": vehicle.mission_total,
-        },
+        "mission": {"phase": vehicle.detector.phase.value, "item": vehicle.mission_seq, "items": vehicle.mission_total},
         "photos": vehicle.photos,
         "home": None if vehicle.home is None else [round(vehicle.home[0], 7), round(vehicle.home[1], 7)],
         "received": vehicle.received,

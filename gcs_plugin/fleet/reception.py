@@ -5,11 +5,11 @@ reasons why a vehicle would not arm.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.dialogues import Dialogues
-from gcs_plugin.fleet.fleet_events import FleetEvent, Pair, mission_event
 from gcs_plugin.fleet.flight_state import Word, danger_of, flight_state
 from gcs_plugin.fleet.heard_messages import HEARD, MESSAGE_IDS, HeardMessage, rates_of
 from gcs_plugin.fleet.link_hub import Hub, Side
@@ -22,7 +22,7 @@ from gcs_plugin.links.packets import Packet
 from gcs_plugin.links.transports import Peer
 from gcs_plugin.mission.completion import RELEVANT, CompletionDetector, MissionEvent, Phase
 from gcs_plugin.mission.exchange import Address, command_long
-from gcs_plugin.mission.flight_modes import modes_of
+from gcs_plugin.mission.flight_modes import HOLDS, modes_of
 from gcs_plugin.mission.track import Lateness
 
 Handler = Callable[[Vehicle, Message, float], None]
@@ -42,6 +42,56 @@ _PARTS_S: Final = 1.5  # its parts are sent one after the other
 _OF_PARTS: Final = frozenset(
     MESSAGE_IDS[name] for name in ("CAMERA_FEEDBACK", "CAMERA_IMAGE_CAPTURED", "GIMBAL_DEVICE_ATTITUDE_STATUS")
 )
+
+
+_WORDS: Final = {
+    MissionEvent.STARTED: "has started its mission",
+    MissionEvent.RESUMED: "goes on with its mission",
+    MissionEvent.COMPLETE: "has completed its mission",
+}
+
+Pair = tuple[int, int]
+"""System ids of two vehicles, in order."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FleetEvent:
+    """Something that happened to a vehicle, with UTC epoch seconds, in one sentence.
+
+    Attributes:
+        kind: `found`, `lost`, `regained`, `rebooted`, `link` (commands go another way), `conflict` (several vehicles
+            with one system id), `single` (no longer), `near` (too near another vehicle), `apart` (no longer), `behind`
+            (later on its mission than plans allow for), `caught_up` (no longer), `danger` (`Vehicle.danger`), `safe`
+            (no longer), `text`, or a mission's `started`, `suspended`, `resumed`, `complete`, `aborted`.
+        pair: the two that `near` and `apart` are about.
+        severity: of a `text`, MAVLink's MAV_SEVERITY (0 emergency ... 6 information).
+    """
+
+    kind: str
+    system: int
+    time_s: float
+    text: str
+    pair: Pair | None = None
+    severity: int = 6
+
+
+def mission_event(event: MissionEvent, vehicle: Vehicle) -> tuple[str, str]:
+    """Kind and words of what has happened to a vehicle's mission."""
+    if event is MissionEvent.ABORTED:
+        flown = vehicle.detector.flown
+        return event.value, f"has ended its mission: {flown.text if flown else 'it was not completed'}"
+    if event is MissionEvent.SUSPENDED:
+        return event.value, _left(vehicle)
+    return event.value, _WORDS[event]
+
+
+def _left(vehicle: Vehicle) -> str:
+    """Why a vehicle is off its mission, as far as its mode tells; that may come a second later than its mission's."""
+    if vehicle.failsafe:
+        return "has left its mission in a failsafe"
+    if vehicle.custom_mode == vehicle.modes.mission:
+        return "has interrupted its mission"
+    return f"has {'paused' if vehicle.mode in HOLDS else 'left'} its mission and is in {vehicle.mode}"
 
 
 class Reception:

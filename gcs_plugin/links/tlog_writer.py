@@ -1,16 +1,15 @@
 """Telemetry logs (.tlog): each packet behind its time of arrival (8 bytes, big-endian, UTC microseconds).
 
-Written, read, and copied by vehicle.
+Written, and copied by vehicle.
 """
 
 import mmap
 import os
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from gcs_plugin.links.packets import V2_MARKER, Framer, Packet, packet_bytes
+from gcs_plugin.links.packets import V2_MARKER, packet_bytes
 
 _TIME = struct.Struct(">Q")
 _STEP: Final = 8  # bytes of the time before each packet of a tlog
@@ -38,20 +37,6 @@ class TlogWriter:
     def close(self) -> None:
         """Flush and close."""
         self._file.close()
-
-
-def read_tlog(path: Path) -> Iterator[tuple[float, Packet]]:
-    """Time of arrival (UTC epoch seconds) and packet, one after the other; broken stretches are skipped."""
-    data = path.read_bytes()
-    at, end = 0, len(data)
-    while at + _STEP + 8 <= end:
-        size = packet_bytes(data, at + _STEP)
-        found = Framer().feed(data[at + _STEP : at + _STEP + size])
-        if found:
-            yield _TIME.unpack_from(data, at)[0] / 1e6, found[0]
-            at += _STEP + size
-        else:
-            at += 1
 
 
 def write_link_log(log: Path, system: int, out: Path) -> int:

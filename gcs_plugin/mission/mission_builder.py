@@ -13,25 +13,14 @@ from pathlib import Path
 from typing import Final
 
 from gcs_plugin.links.mavlink import Autopilot
+from gcs_plugin.mission import items as mav
 from gcs_plugin.mission import mission_files
-from gcs_plugin.mission.items import (
-    FRAME_GLOBAL,
-    FRAME_MISSION,
-    JUMP,
-    LAND,
-    LOITER_TIME,
-    TAKEOFF,
-    TAKEOFFS,
-    TRIGGER_DISTANCE,
-    WAYPOINT,
-    Mission,
-    MissionItem,
-)
+from gcs_plugin.mission.items import Mission, MissionItem
 from gcs_plugin.mission.makers.maker_files import read_mission_file
 from orthoswarm.config.autopilot import ARDUPILOT
 from orthoswarm.model.errors import InputError
 
-_WITH_YAW: Final = frozenset({WAYPOINT, TAKEOFF, LAND, LOITER_TIME})
+_WITH_YAW: Final = frozenset({mav.WAYPOINT, mav.TAKEOFF, mav.LAND, mav.LOITER_TIME})
 
 
 def build_mission(
@@ -57,7 +46,7 @@ def build_mission(
         raise InputError(f"{name or 'the mission'} has no items; plan one with: orthoswarm plan")
     if autopilot is Autopilot.ARDUPILOT:
         first = next((item.place for item in flown if item.has_place and item.place), (0.0, 0.0))
-        flown.insert(0, MissionItem.at(WAYPOINT, *(home or (*first, 0.0)), frame=FRAME_GLOBAL))
+        flown.insert(0, MissionItem.at(mav.WAYPOINT, *(home or (*first, 0.0)), frame=mav.FRAME_GLOBAL))
     mission = Mission(autopilot, tuple(flown), name)
     _check(mission)
     return mission
@@ -68,7 +57,7 @@ def unflyable(items: Sequence[MissionItem], autopilot: Autopilot, *, in_air: boo
     flown = [item for item in items[autopilot.first_seq :] if item.is_nav]
     if not flown:
         return "has no mission; upload one first"
-    if not in_air and flown[0].command not in TAKEOFFS:
+    if not in_air and flown[0].command not in mav.TAKEOFFS:
         return f"has a mission that begins with {flown[0].name} instead of a takeoff; upload one that takes off"
     return ""
 
@@ -93,15 +82,15 @@ def _wire(item: mission_files.FileItem, autopilot: Autopilot) -> MissionItem:
         x, y = (int(value) if math.isfinite(value) else 0 for value in (item.lat_deg, item.lon_deg))
         placed = replace(placed, x=x, y=y)
         # its param5 to 7 are unused; files may have leftovers of other items there
-        if item.command == TRIGGER_DISTANCE:
+        if item.command == mav.TRIGGER_DISTANCE:
             placed = MissionItem.do(item.command, *item.params)
     unset = 0.0 if autopilot is Autopilot.ARDUPILOT else math.nan  # one object: missions read twice are equal
     params = [unset if math.isnan(value) else value for value in placed.params]
     if autopilot is Autopilot.PX4 and item.command in _WITH_YAW and not params[3]:
         params[3] = math.nan
-    if autopilot is Autopilot.PX4 and item.command == JUMP:
+    if autopilot is Autopilot.PX4 and item.command == mav.JUMP:
         params[0] -= 1.0
-    frame = FRAME_MISSION if not placed.has_place and placed.frame == FRAME_GLOBAL else placed.frame
+    frame = mav.FRAME_MISSION if not placed.has_place and placed.frame == mav.FRAME_GLOBAL else placed.frame
     z = placed.z if math.isfinite(placed.z) else 0.0
     return replace(
         placed, params=(params[0], params[1], params[2], params[3]), frame=frame, z=z, autocontinue=item.autocontinue
@@ -117,7 +106,7 @@ def _check(mission: Mission) -> None:
         if item.has_place and not (abs(item.lat_deg) <= 90.0 and abs(item.lon_deg) <= 180.0):
             where = f"{item.lat_deg:g}, {item.lon_deg:g}"
             raise InputError(f"{name}: item {seq} ({item.name}) lies at {where}, which is not a place; correct it")
-        if item.command == JUMP and not mission.first_seq <= item.params[0] < len(mission):
+        if item.command == mav.JUMP and not mission.first_seq <= item.params[0] < len(mission):
             target = item.params[0] + 1 - mission.first_seq
             raise InputError(f"{name}: item {seq} jumps to item {target:g}, which it does not have; correct it")
         if not math.isfinite(item.z) or abs(item.z) >= 1e6:

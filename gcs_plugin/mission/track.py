@@ -16,19 +16,8 @@ from typing import Final
 import numpy as np
 
 from gcs_plugin.config import LIMITS
-from gcs_plugin.mission.items import (
-    CHANGE_SPEED,
-    DELAY,
-    FRAME_GLOBAL,
-    JUMP,
-    LANDINGS,
-    LOITER_TIME,
-    RTL,
-    TAKEOFFS,
-    WAYPOINT,
-    Mission,
-    MissionItem,
-)
+from gcs_plugin.mission import items as mav
+from gcs_plugin.mission.items import Mission, MissionItem
 from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 from orthoswarm.config import DEFAULT, Config
 from orthoswarm.config.autopilot import ARDUPILOT, AutopilotTimes
@@ -110,23 +99,23 @@ def flight_path(mission: Mission, origin: tuple[float, float]) -> tuple[Array, A
     if home is not None:
         points.append((*metres(*home, origin), 0.0))
     for _, item in _flown(mission):
-        if item.command == CHANGE_SPEED and item.params[1] > 0.0:
+        if item.command == mav.CHANGE_SPEED and item.params[1] > 0.0:
             speed = item.params[1]
-        elif item.command == RTL and home is not None and points:
+        elif item.command == mav.RTL and home is not None and points:
             top = points[-1][2]
             points += [(*metres(*home, origin), top), (*metres(*home, origin), 0.0)]
-        elif item.command == DELAY and item.params[0] > 0.0 and points:
+        elif item.command == mav.DELAY and item.params[0] > 0.0 and points:
             points.append(points[-1])
             waits[len(points) - 1] = item.params[0]
         elif item.is_nav and item.has_place:
             height, place = _height_m(item, base), item.place or home
             if place is None:
                 continue
-            if item.command in LANDINGS and points:
+            if item.command in mav.LANDINGS and points:
                 points.append((*metres(*place, origin), points[-1][2]))
                 height = 0.0
             points.append((*metres(*place, origin), height))
-            if item.command == LOITER_TIME or (item.command == WAYPOINT and item.params[0] > 0.0):
+            if item.command == mav.LOITER_TIME or (item.command == mav.WAYPOINT and item.params[0] > 0.0):
                 points.append(points[-1])
                 waits[len(points) - 1] = item.params[0]
     before = np.array([waits.get(k, 0.0) for k in range(len(points))])
@@ -141,7 +130,7 @@ def _flown(mission: Mission) -> Iterator[tuple[int, MissionItem]]:
             return
         item = items[seq]
         target, times = item.params[:2]
-        if item.command != JUMP:
+        if item.command != mav.JUMP:
             yield seq, item
         elif 0 <= target < len(items) and jumped.get(seq, 0) < (_FOREVER if times < 0 else times):
             jumped[seq] = jumped.get(seq, 0) + 1
@@ -158,8 +147,8 @@ def track_of(mission: Mission, origin: tuple[float, float], config: Config = DEF
     points, waits, speed = flight_path(mission, origin)
     if len(points) < 2:
         return Track(points, times)
-    end = next((item.command for item in mission.items if item.command in (RTL, *LANDINGS)), RTL)
-    motion = Motion(speed_m_s=speed, autopilot=times, lands=end != RTL)
+    end = next((item.command for item in mission.items if item.command in (mav.RTL, *mav.LANDINGS)), mav.RTL)
+    motion = Motion(speed_m_s=speed, autopilot=times, lands=end != mav.RTL)
     return Track(motion.places(points, waits, STEP_S), motion.autopilot)
 
 
@@ -171,7 +160,7 @@ def flight_seconds(mission: Mission) -> float:
 
 def fastest_m_s(mission: Mission) -> float | None:
     """The greatest speed that a mission asks for, None if it leaves that to the vehicle."""
-    speeds = [item.params[1] for item in mission.items if item.command == CHANGE_SPEED and item.params[1] > 0.0]
+    speeds = [item.params[1] for item in mission.items if item.command == mav.CHANGE_SPEED and item.params[1] > 0.0]
     return max(speeds, default=None)
 
 
@@ -185,7 +174,7 @@ def route_points(mission: Mission) -> list[tuple[int, float, float]]:
     """Where a mission leads, in the order of flight: sequence number of the item, longitude and latitude in degrees."""
     home, route = home_of(mission), list[tuple[int, float, float]]()
     for seq, item in _flown(mission):
-        place = home if item.command == RTL else item.place if item.is_nav and item.has_place else None
+        place = home if item.command == mav.RTL else item.place if item.is_nav and item.has_place else None
         if place is not None:
             route.append((seq, place[1], place[0]))
     return route
@@ -235,10 +224,7 @@ class Airspace:
 
     @classmethod
     def of(
-        cls,
-        missions: Mapping[int, Mission],
-        levels_m: Mapping[int, float] | None = None,
-        needs: PlanNeeds = NO_NEEDS,
+        cls, missions: Mapping[int, Mission], levels_m: Mapping[int, float] | None = None, needs: PlanNeeds = NO_NEEDS
     ) -> "Airspace":
         """Of missions by system id.
 
@@ -356,7 +342,7 @@ def near_samples(one: Track, other: Track, distance_m: float, height_m: float | 
 def takeoff_place(mission: Mission) -> tuple[float, float] | None:
     """The place that the takeoff of a mission states, degrees; None if it states none."""
     flown = mission.items[mission.first_seq :]
-    return next((item.place for item in flown if item.command in TAKEOFFS and item.place), None)
+    return next((item.place for item in flown if item.command in mav.TAKEOFFS and item.place), None)
 
 
 def home_of(mission: Mission) -> tuple[float, float] | None:
@@ -368,7 +354,7 @@ def home_of(mission: Mission) -> tuple[float, float] | None:
 
 def _height_m(item: MissionItem, base_m: float) -> float:
     """Height of an item above takeoff, which lies at `base_m` above the sea; metres."""
-    return item.z - (base_m if item.plain_frame == FRAME_GLOBAL else 0.0)
+    return item.z - (base_m if item.plain_frame == mav.FRAME_GLOBAL else 0.0)
 
 
 def _ground_m(mission: Mission) -> float:

@@ -17,22 +17,9 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect
+from gcs_plugin.mission import exchange
 from gcs_plugin.mission.download import MissionDownload
-from gcs_plugin.mission.exchange import (
-    ACCEPTED,
-    CANCELLED,
-    DENIED,
-    ERROR,
-    INVALID,
-    INVALID_SEQUENCE,
-    MISSION,
-    NO_SPACE,
-    UNSUPPORTED,
-    UNSUPPORTED_FRAME,
-    Exchange,
-    RoundTrip,
-    Verdict,
-)
+from gcs_plugin.mission.exchange import MISSION, Exchange, RoundTrip, Verdict
 from gcs_plugin.mission.items import Mission, difference
 
 _PARAMETER = {6: "param1", 7: "param2", 8: "param3", 9: "param4", 10: "latitude", 11: "longitude", 12: "altitude"}
@@ -122,7 +109,7 @@ class MissionUpload(Exchange):
             return self._follow(self.leave, self.leave.feed(message, now), now)
         kind = self._mission_kind(message)
         if self.stage is UploadStage.CLEAR:
-            if kind == "MISSION_ACK" and message.type == ACCEPTED:
+            if kind == "MISSION_ACK" and message.type == exchange.ACCEPTED:
                 self._unknown("was cleared")
             return []
         if kind in ("MISSION_REQUEST", "MISSION_REQUEST_INT"):
@@ -259,25 +246,30 @@ class MissionUpload(Exchange):
         return [self._item(self._served)]
 
     def _acknowledged(self, code: int, message: Message, now: float) -> list[Message]:
-        if code != DENIED:
+        if code != exchange.DENIED:
             self._heard_at = now
         if self._reading is not None:
-            if code == CANCELLED:  # it was still waiting for an item
+            if code == exchange.CANCELLED:  # it was still waiting for an item
                 return self._announce(now)
             return self._read(self._reading.feed(message, now), now)
-        if code == INVALID_SEQUENCE and self.stage is UploadStage.ITEMS and self._repeated and not self._all_sent:
+        if (
+            code == exchange.INVALID_SEQUENCE
+            and self.stage is UploadStage.ITEMS
+            and self._repeated
+            and not self._all_sent
+        ):
             self._ahead = self._served + 1
             return [self._item(self._ahead)]  # it has that one, so it waits for the next
-        if self.stage is UploadStage.PAUSE or code == INVALID_SEQUENCE:
+        if self.stage is UploadStage.PAUSE or code == exchange.INVALID_SEQUENCE:
             return []
         if self.stage is UploadStage.COUNT:
             return self._answered_count(code, now)
-        if code == ACCEPTED:
+        if code == exchange.ACCEPTED:
             return self._verify(now) if self._all_sent else []
-        if code == CANCELLED:
+        if code == exchange.CANCELLED:
             return self._announce(now)
         refusal = explain(code, self.mission, self._served)
-        if code == ERROR:
+        if code == exchange.ERROR:
             # About this item, about a copy of it, or about an upload that the vehicle has given up: further
             # requests, or what is stored, will tell.
             self._doubt = None if self._repeated else refusal
@@ -289,14 +281,14 @@ class MissionUpload(Exchange):
 
     def _answered_count(self, code: int, now: float) -> list[Message]:
         """An acknowledgement before the first request: about the count, or a late one from an upload before."""
-        if code in (NO_SPACE, DENIED):
+        if code in (exchange.NO_SPACE, exchange.DENIED):
             return self._nack(explain(code, self.mission, None), now)
-        if code == ERROR:
+        if code == exchange.ERROR:
             return self._pause(now, _COUNT_AGAIN_S)
-        return self._verify(now) if code == ACCEPTED and not self.mission.items else []
+        return self._verify(now) if code == exchange.ACCEPTED and not self.mission.items else []
 
     def _nack(self, refusal: Refusal, now: float) -> list[Message]:
-        if refusal.code == DENIED:
+        if refusal.code == exchange.DENIED:
             self._denied = refusal
             self._begun -= self.stage is UploadStage.COUNT  # waiting for another ground station is not an attempt
             return self._pause(now, _DENIED_AGAIN_S)
@@ -378,19 +370,19 @@ def explain(code: int, mission: Mission, item: int | None) -> Refusal:
         code: its MAV_MISSION_RESULT. mission: the uploaded one.
         item: the last item sent, None if the vehicle had not requested one yet.
     """
-    if code == DENIED:
+    if code == exchange.DENIED:
         return Refusal(code, None, "", "another ground station is uploading to it; wait until that has ended")
-    if code == NO_SPACE:
+    if code == exchange.NO_SPACE:
         less = "split the mission into sorties" if mission.list_type == MISSION else "draw zones with fewer corners"
         return Refusal(code, None, "", f"its memory does not hold {len(mission)} items; {less}")
-    if code == CANCELLED:
+    if code == exchange.CANCELLED:
         return Refusal(code, None, "", "it gave up because items did not arrive; come closer or try again")
     if item is None or item >= len(mission):
         return Refusal(code, None, "", f"it refused the {mission.kind} ({_result_name(code)})")
     what = f"item {item} ({mission.items[item].name})"
-    if code == UNSUPPORTED:
+    if code == exchange.UNSUPPORTED:
         return Refusal(code, item, "command", f"{what} is a command that it does not know; leave it out")
-    if code == UNSUPPORTED_FRAME:
+    if code == exchange.UNSUPPORTED_FRAME:
         frame = dialect.enums["MAV_FRAME"].get(mission.items[item].frame)
         name = frame.name if frame else mission.items[item].frame
         return Refusal(
@@ -399,7 +391,7 @@ def explain(code: int, mission: Mission, item: int | None) -> Refusal:
     if code in _PARAMETER:
         name, value = _PARAMETER[code], _value(mission, item, code)
         return Refusal(code, item, name, f"{what} has an unacceptable {name} ({value}); correct it")
-    if code == INVALID:
+    if code == exchange.INVALID:
         return Refusal(code, item, "", f"{what} has an unacceptable value; check its parameters")
     return Refusal(code, item, "", f"it refused {what} ({_result_name(code)}); check that item, a jump's target too")
 

@@ -1,6 +1,8 @@
 """Areas, lines and no-fly zones from files.
 
 GeoJSON, KML, KMZ, zipped shapefile, GeoPackage, QGroundControl `.plan` and `.waypoints`, routes of Pilot 2 and Litchi.
+No-fly zones near the flights become rings for the planner and fences for the vehicles: files of authorities hold all
+zones of a country, so what is farther away than any flight goes is counted, and not used.
 """
 
 import codecs
@@ -9,7 +11,8 @@ import re
 import warnings
 import zipfile
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Final, NamedTuple
 
@@ -19,23 +22,14 @@ import shapely
 from gcs_plugin.mission.makers.litchi import is_litchi
 from gcs_plugin.mission.makers.maker_files import read_mission_file
 from gcs_plugin.mission.mission_files import SurveySettings
+from orthoswarm.model.angles import wrap_deg
 from orthoswarm.model.coordinate_system import to_degrees
+from orthoswarm.model.earth import DEGREE_M
 from orthoswarm.model.errors import InputError
-from orthoswarm.model.plan import Fence
-from orthoswarm.planning.area.shape_files import (
-    SIZES,
-    Circle,
-    Polygon,
-    Ring,
-    Shapes,
-    circle_of,
-    counted,
-    parse_geojson,
-    parse_kml,
-    refuse_many_corners,
-    ring,
-    strip_of,
-)
+from orthoswarm.model.plan import Fence, Plan
+from orthoswarm.planning.area import shape_files
+from orthoswarm.planning.area.shape_files import Circle, Polygon, Ring, Shapes, counted
+from orthoswarm.planning.sorties.flight_heights import BESIDE_M
 
 _KINDS: Final = {
     ".geojson": ("GeoJSON",),
@@ -48,6 +42,7 @@ _KINDS: Final = {
     ".waypoints": ("a mission",),
     ".csv": ("a mission",),
 }
+_REACH_M: Final = 5000.0  # zones farther from the area and the starts than this, and than their own extent, are far
 _LARGEST_BYTES: Final = 50_000_000
 _SHAPEFILE: Final = b"\x00\x00\x27\x0a"
 _ROUTE: Final = "waylines.wpml"
@@ -87,17 +82,19 @@ def read_shapes(path: Path, name: str | None = None, *, any_size: bool = False) 
         return AreaFile(Shapes.joined([_shapes(f"/vsizip/{{{path}}}/{place}", name, any_size) for place in places]), [])
     if kind in ("GeoJSON", "zipped GeoJSON"):
         texts = _texts(path, name, _GEOJSON)
-        return AreaFile(Shapes.joined([parse_geojson(text, name, any_size=any_size) for text in texts]), [])
+        return AreaFile(Shapes.joined([shape_files.parse_geojson(text, name, any_size=any_size) for text in texts]), [])
     route = kind == "KMZ" and bool(_inside(path, name, _ROUTE))
     if kind in ("KML", "KMZ") and not route:
-        return AreaFile(Shapes.joined([parse_kml(t, name, any_size=any_size) for t in _texts(path, name)]), [])
+        return AreaFile(
+            Shapes.joined([shape_files.parse_kml(t, name, any_size=any_size) for t in _texts(path, name)]), []
+        )
     mission = read_mission_file(path.read_bytes() if route else _texts(path, name)[0].encode(), name)
-    polygons = tuple(Polygon(ring(survey, name)) for survey in mission.surveys)
-    lines = tuple(ring(line, name, 2) for line in (mission.polylines or mission.lines()))
+    polygons = tuple(Polygon(shape_files.ring(survey, name)) for survey in mission.surveys)
+    lines = tuple(shape_files.ring(line, name, 2) for line in (mission.polylines or mission.lines()))
     for fence in mission.fences:
         if fence.radius_m is None:
-            ring(fence.points, name)
-    zones = [ring(zone, name) for zone in mission.no_fly]
+            shape_files.ring(fence.points, name)
+    zones = [shape_files.ring(zone, name) for zone in mission.no_fly]
     return AreaFile(Shapes(polygons, lines), zones, mission.fences, mission.survey)
 
 
@@ -151,11 +148,7 @@ def _left_by_macos(name: str) -> bool:
 
 
 def _texts(path: Path, name: str, suffix: str | tuple[str, ...] = ".kml") -> list[str]:
-    """The text of a file, those of a ZIP's files with a suffix, in the encoding that it has or that its XML declares.
-
-    Raises:
-        InputError: it is not text.
-    """
+    """The text of a file, or of those in a ZIP with a suffix, in the encoding that it has or that its XML declares."""
     try:
         data = [path.read_bytes()]
         if data[0].startswith(b"PK\x03\x04"):
@@ -192,11 +185,7 @@ def _is_mission(text: str, name: str) -> bool:
 
 
 def _shapes(source: str, name: str, any_size: bool) -> Shapes:
-    """Polygons and lines of all layers of a file that OGR reads.
-
-    Raises:
-        InputError: it cannot, the file says no coordinate system, or its coordinates are of no use.
-    """
+    """Polygons and lines of all layers of a file that OGR reads."""
     from pyogrio import list_layers
     from pyogrio.errors import DataLayerError, DataSourceError, FeatureError, FieldError, GeometryError
 
@@ -218,22 +207,22 @@ def _shapes(source: str, name: str, any_size: bool) -> Shapes:
             polygons.append(Polygon(shell, tuple(holes)))
         elif part.geom_type == "LineString":
             line = _degrees(part.coords, crs, name, 2)
-            strip = strip_of(line, said, name)
+            strip = shape_files.strip_of(line, said, name)
             polygons += strip
             lines += [] if strip else [line]
         elif part.geom_type == "Point" and (circle := _circle(part, crs, said, name)) is not None:
             circles.append(circle)
         else:
             unused[part.geom_type.lower()] += 1
-    found = Shapes(tuple(polygons), tuple(lines), tuple(circles), unused=counted(unused))
+    found = Shapes(tuple(polygons), tuple(lines), tuple(circles), unused=shape_files.counted(unused))
     if not any_size:
-        refuse_many_corners([*found.areas, *lines], name)
+        shape_files.refuse_many_corners([*found.areas, *lines], name)
     return found
 
 
 def _circle(point: Any, crs: str | None, said: dict[str, Any], name: str) -> Circle | None:
     [lat, lon] = _degrees(point.coords, crs, name, 1)[0]
-    return circle_of(float(lat), float(lon), said, name)
+    return shape_files.circle_of(float(lat), float(lon), said, name)
 
 
 def _parts_of(source: str, layer: str) -> Iterator[tuple[str | None, Any, dict[str, Any]]]:
@@ -241,7 +230,7 @@ def _parts_of(source: str, layer: str) -> Iterator[tuple[str | None, Any, dict[s
     from pyogrio import read_info
     from pyogrio.raw import read
 
-    sizes = [field for field in read_info(source, layer=layer)["fields"] if field.lower() in SIZES]
+    sizes = [field for field in read_info(source, layer=layer)["fields"] if field.lower() in shape_files.SIZES]
     meta, _, geometries, values = read(source, layer=layer, columns=sizes, force_2d=True)
     said = {field.lower(): column for field, column in zip(meta["fields"], values, strict=True)}
     for k, geometry in enumerate(shapely.from_wkb(geometries)):
@@ -260,4 +249,123 @@ def _degrees(points: object, crs: str | None, name: str, least: int = 3) -> Ring
         lon_lat, _ = to_degrees(crs, array[:, 0], array[:, 1])
     except InputError as error:
         raise InputError(f"{name}: {error}; or export it in WGS 84 (EPSG:4326)") from None
-    return ring(lon_lat[:, ::-1], name, least)
+    return shape_files.ring(lon_lat[:, ::-1], name, least)
+
+
+class Reach:
+    """A box about what is flown over, in degrees, wide enough for the ways around zones."""
+
+    def __init__(self, flown: Ring) -> None:
+        """flown: float64 (n, 2), latitude and longitude in degrees, of the area or the lines and of the starts."""
+        self._lon = float(flown[0, 1])
+        east = wrap_deg(flown[:, 1] - self._lon)
+        low, high = np.array([flown[:, 0].min(), east.min()]), np.array([flown[:, 0].max(), east.max()])
+        metres = DEGREE_M * np.array([1.0, max(np.cos(np.radians(np.abs(flown[:, 0]).max())), 0.01)])
+        beyond = max(_REACH_M, float(np.linalg.norm((high - low) * metres))) / metres
+        self._low, self._high, self._metres = low - beyond, high + beyond, metres
+
+    def touches(self, ring: Ring, grown_m: float = 0.0) -> bool:
+        """Whether the box about a ring (or a point), so much larger, has ground in common with this one."""
+        first = wrap_deg(float(ring[0, 1]) - self._lon)
+        east = first + wrap_deg(ring[:, 1] - ring[0, 1])  # a zone across the date line is no belt around the Earth
+        low, high = np.array([ring[:, 0].min(), east.min()]), np.array([ring[:, 0].max(), east.max()])
+        grown = grown_m / self._metres
+        return bool((low - grown <= self._high).all() and (high + grown >= self._low).all())
+
+    def touches_exchanged(self, shapes: Shapes) -> bool:
+        """Whether it would touch shapes whose latitudes were their longitudes."""
+        centres = [np.array([[circle.lat_deg, circle.lon_deg]]) for circle in shapes.circles]
+        return any(self.touches(ring[:, ::-1]) for ring in [*(p.shell for p in shapes.polygons), *centres])
+
+    def near(self, shapes: Shapes) -> Shapes:
+        """The polygons and circles of shapes that it touches."""
+        polygons = tuple(p for p in shapes.polygons if self.touches(p.shell))
+        centre = {circle: np.array([[circle.lat_deg, circle.lon_deg]]) for circle in shapes.circles}
+        circles = tuple(c for c in shapes.circles if self.touches(centre[c], c.radius_m))
+        return replace(shapes, polygons=polygons, circles=circles)
+
+
+@dataclass(frozen=True, slots=True)
+class NoFly:
+    """The no-fly zones of a plan.
+
+    Attributes:
+        rings: outlines of polygons, of exclusion fences, and around circles. fences: of missions, and circles.
+        circles_wider_m: by how much rings lie outside their circles, 0 without a circle.
+        reach: of which the zones are all of its files; notes: on what is not used.
+    """
+
+    rings: list[Ring]
+    fences: list[Fence]
+    circles_wider_m: float
+    reach: Reach
+    notes: list[str]
+
+    def refuse_beyond(self, plan: Plan) -> None:
+        """Refuse a plan that leads to where zones were not used; raises InputError: it does."""
+        points = [(w.lat_deg, w.lon_deg) for v in plan.vehicles for s in v.sorties for w in s.waypoints]
+        if self.notes and not all(self.reach.touches(np.array([point])) for point in points):
+            raise InputError(
+                "the way around no-fly zones leads farther than the zones that were used; plan from nearer starts, or "
+                "give files of the zones around there only"
+            )
+
+
+def read_no_fly(paths: Sequence[Path], flown: Ring, clearance_m: float | None) -> NoFly:
+    """The zones of no-fly files near what is flown over.
+
+    Circles become fences of the vehicles, so rings keep the distance at which receivers do not break a fence.
+
+    Args:
+        paths: of the files. flown: see Reach. clearance_m: distance that plans keep to zones by themselves.
+
+    Raises:
+        InputError: a file cannot be read, or holds anything that no vehicle could be kept out of.
+    """
+    reach, rings, fences, notes, round_ = Reach(flown), list[Ring](), list[Fence](), list[str](), False
+    beyond_m = max(0.0, BESIDE_M - (clearance_m or 0.0))
+    for path in paths:
+        file = read_zones(path)
+        near = reach.near(file.shapes)
+        far = len(file.shapes.polygons) + len(file.shapes.circles) - len(near.polygons) - len(near.circles)
+        if far and not near.polygons and not near.circles and reach.touches_exchanged(file.shapes):
+            raise InputError(
+                f"{path.name} has zones at the flights if latitude and longitude are exchanged; longitude comes first"
+            )
+        if far:
+            notes.append(f"of {path.name}, {', '.join(counted({'zone': far}))} far from the flights: not used")
+        rings += [p.shell for p in near.polygons] + [c.polygon(beyond_m).shell for c in near.circles] + file.no_fly
+        fences += file.fences
+        fences += [Fence(inclusion=False, points=((c.lat_deg, c.lon_deg),), radius_m=c.radius_m) for c in near.circles]
+        round_ = round_ or bool(near.circles)
+    return NoFly(rings, fences, beyond_m if round_ else 0.0, reach, notes)
+
+
+def read_zones(path: Path) -> AreaFile:
+    """What vehicles are to keep out of, by a no-fly file: all of it, also what is switched off there.
+
+    Raises:
+        InputError: the file cannot be read, or holds anything that no vehicle could be kept out of.
+    """
+    file = read_shapes(path, any_size=True)
+    shapes = file.shapes
+    refuse_no_zones(shapes, str(path), mission=bool(file.no_fly))
+    shapes = replace(shapes, polygons=shapes.polygons + shapes.hidden, hidden=())
+    if not shapes.polygons and not shapes.circles and not file.no_fly:
+        raise InputError(f"{path} holds no polygon to keep out of; give a polygon with --no-fly")
+    return file._replace(shapes=shapes)
+
+
+def refuse_no_zones(shapes: Shapes, name: str, *, mission: bool = False) -> None:
+    """Refuse shapes of which a part would be passed over as no-fly zones; a mission's lines are flown.
+
+    Raises:
+        InputError: there are such shapes.
+    """
+    count = 0 if mission else len(shapes.lines)
+    left = [*shapes.unused, *counted({"line": count} if count else {})]
+    if left:
+        raise InputError(
+            f"{name} holds {', '.join(left)}, which no vehicle could be kept out of; draw each zone as a polygon, or "
+            "give a point its radius_m and a line its width_m, in metres"
+        )

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from gcs_plugin.mission.makers.litchi import MOST_POINTS
 from gcs_plugin.mission.makers.maker_files import LITCHI, MAKERS
-from gcs_plugin.plans.area_files import read_shapes
-from gcs_plugin.plans.no_fly import NoFly, read_no_fly
+from gcs_plugin.plans.area_files import NoFly, read_no_fly, read_shapes
 from orthoswarm.config import DEFAULT, Config
 from orthoswarm.coverage.missing_pictures import Cause
 from orthoswarm.model.bounding_box import BoundingBox
@@ -140,11 +139,7 @@ class PlanRequest:
         return Motion(self.speed_m_s, wind_m_s=wind, autopilot=autopilot)
 
     def flight_options(self) -> PlanOptions:
-        """How the flights are to be.
-
-        Raises:
-            InputError: a value means nothing.
-        """
+        """How the flights are to be; raises InputError: a value means nothing."""
         if unknown := [name for name in self.autopilots if name not in AUTOPILOTS]:
             raise InputError(f"'{unknown[0]}' flies no mission of ours; choose one of {', '.join(AUTOPILOTS)}")
         if not 0.0 <= self.swap_min < math.inf:
@@ -277,20 +272,12 @@ def _closed(line: Ring) -> bool:
     return len(line) > 3 and bool(steps[-1] <= 0.01 * steps.sum())
 
 
-def _over_ground(
-    request: PlanRequest,
-    cover: Callable[..., Plan],
-    wanted: shapely.Geometry,
-    grid: LocalGrid,
-) -> Plan:
+def _over_ground(request: PlanRequest, cover: Callable[..., Plan], wanted: shapely.Geometry, grid: LocalGrid) -> Plan:
     """The plan over the height model of a request, or over level ground without one.
 
     Args:
         request: as given. cover: plans at a height above ground, with its footprint and the `heights` of the flights.
         wanted: what is to be flown over, metres of the grid.
-
-    Raises:
-        InputError: the height model cannot be used, there is no start, or as `cover`.
     """
 
     def make(above_m: float, foot: Footprint, heights: FlightHeights | None) -> Plan:

@@ -8,25 +8,9 @@ from random import Random
 from typing import Final
 
 from gcs_plugin.links.mavlink import Autopilot
+from gcs_plugin.mission import items as mav
 from gcs_plugin.mission.flight_modes import Modes
-from gcs_plugin.mission.items import (
-    CHANGE_SPEED,
-    DELAY,
-    FRAME_GLOBAL,
-    GIMBAL_CLAIM,
-    GIMBAL_PITCH,
-    JUMP,
-    LAND,
-    LANDINGS,
-    LOITER_TIME,
-    LOITER_UNLIM,
-    MOUNT_CONTROL,
-    RTL,
-    TAKEOFF,
-    TRIGGER_DISTANCE,
-    WAYPOINT,
-    MissionItem,
-)
+from gcs_plugin.mission.items import MissionItem
 from gcs_plugin.sim.mission_store import MissionStore
 from gcs_plugin.sim.multirotor import STEP_S, Airframe, Chart, VehicleMotion, VehiclePose
 from orthoswarm.model.angles import wrap_rad
@@ -189,7 +173,7 @@ class MissionFlight:
         if len(self.store.items) <= first:
             return "No mission"
         begins = self._next_nav(first)
-        if self.landed is Landed.ON_GROUND and (begins is None or self.store.items[begins].command != TAKEOFF):
+        if self.landed is Landed.ON_GROUND and (begins is None or self.store.items[begins].command != mav.TAKEOFF):
             return "Auto: Missing Takeoff Cmd" if self.autopilot is Autopilot.ARDUPILOT else "Takeoff waypoint required"
         if self.autopilot is Autopilot.ARDUPILOT and not self.armed:
             return "Mission start: not armed"
@@ -209,7 +193,7 @@ class MissionFlight:
         if self.state is not MissionState.ACTIVE or self._task is not Task.ITEM or self.mode != self.modes.mission:
             return False
         item = self.store.items[self.seq]
-        if item.command in (TAKEOFF, LAND, RTL):
+        if item.command in (mav.TAKEOFF, mav.LAND, mav.RTL):
             return False
         if go_on == self.paused:
             self.paused = not go_on
@@ -324,17 +308,17 @@ class MissionFlight:
         self._hold(at_target=True)
 
     def _do(self, seq: int, item: MissionItem) -> int | None:
-        if item.command == TRIGGER_DISTANCE:
+        if item.command == mav.TRIGGER_DISTANCE:
             self._trigger_m, self._last_photo = item.params[0], None
             if item.params[0] > 0.0 and not item.params[2]:  # the first picture only after the distance
                 self._last_photo = self.motion.seen
-        elif item.command == CHANGE_SPEED and item.params[1] > 0.0:
+        elif item.command == mav.CHANGE_SPEED and item.params[1] > 0.0:
             self.motion.speed = self.motion.airframe.held_m_s(item.params[1])
         elif self.gimbal_pitch_deg is not None and self._may_turn(item):
             self.gimbal_pitch_deg = item.params[0]
-        elif item.command == GIMBAL_CLAIM:
+        elif item.command == mav.GIMBAL_CLAIM:
             self._in_control = True
-        elif item.command == JUMP and self._jumps.get(seq, 0) < item.params[1]:
+        elif item.command == mav.JUMP and self._jumps.get(seq, 0) < item.params[1]:
             self._jumps[seq] = self._jumps.get(seq, 0) + 1
             return int(item.params[0])
         return None
@@ -342,21 +326,23 @@ class MissionFlight:
     def _may_turn(self, item: MissionItem) -> bool:
         """Whether an item turns its gimbal; PX4 ignores a manager's command before it was given control."""
         px4 = self.autopilot is Autopilot.PX4
-        return item.command == MOUNT_CONTROL or (item.command == GIMBAL_PITCH and (self._in_control or not px4))
+        return item.command == mav.MOUNT_CONTROL or (item.command == mav.GIMBAL_PITCH and (self._in_control or not px4))
 
     def _begin(self, item: MissionItem) -> None:
-        lifts = item.command == TAKEOFF or (self.autopilot is Autopilot.PX4 and item.command not in (RTL, LAND))
+        lifts = item.command == mav.TAKEOFF or (
+            self.autopilot is Autopilot.PX4 and item.command not in (mav.RTL, mav.LAND)
+        )
         if self.landed is Landed.ON_GROUND and not lifts:  # ArduCopter wants a takeoff
             self._task = Task.STAND
             return
         self.texts.append(f"Mission: {self.seq} {item.name}")
-        if item.command == RTL:
+        if item.command == mav.RTL:
             if self.autopilot is Autopilot.PX4:
                 self._finish()
                 self.mode = self.modes.rtl
             self._ends_mission = self.autopilot is Autopilot.ARDUPILOT
             self._go_home()
-        elif item.command in LANDINGS:
+        elif item.command in mav.LANDINGS:
             self._aim(item)
             self._ends_mission = True
         else:
@@ -370,14 +356,14 @@ class MissionFlight:
         if self.paused:
             motion.stop()
             return
-        if item.command != TAKEOFF and (item.x or item.y):
+        if item.command != mav.TAKEOFF and (item.x or item.y):
             north, east = motion.chart.to_metres(item.lat_deg, item.lon_deg)
-        height = item.z - (motion.chart.alt_m if item.plain_frame == FRAME_GLOBAL else 0.0)
-        if item.command == TAKEOFF and motion.up > _LIFTED_M:  # it flies: where it stops, and no lower
+        height = item.z - (motion.chart.alt_m if item.plain_frame == mav.FRAME_GLOBAL else 0.0)
+        if item.command == mav.TAKEOFF and motion.up > _LIFTED_M:  # it flies: where it stops, and no lower
             motion.stop()
             motion.climb_to(height)
             return
-        stays_high = item.command in LANDINGS or not item.has_place
+        stays_high = item.command in mav.LANDINGS or not item.has_place
         # On a leg it keeps to the line, which is what makes the leg straight.
         motion.go((north, east, motion.up if stays_high else height), along_line=bool(self._reached_any))
 
@@ -385,23 +371,23 @@ class MissionFlight:
         if self.paused:
             return
         horizontal, vertical = self.motion.distance()
-        if self.landed is Landed.TAKEOFF and self.motion.up > 2.0 and item.command != TAKEOFF:
+        if self.landed is Landed.TAKEOFF and self.motion.up > 2.0 and item.command != mav.TAKEOFF:
             self.landed = Landed.IN_AIR
         if horizontal > _REACHED_M or vertical > 1.0:
             return
-        if item.command in LANDINGS:
+        if item.command in mav.LANDINGS:
             times = self.motion.airframe.times
             self._waited += STEP_S
             if self.motion.target and (times is None or self._waited > times.land_wait_s - _OWN_STOP_S):
                 self._descend(self.motion.target[0], self.motion.target[1])
             return
-        if item.command == LOITER_UNLIM:
+        if item.command == mav.LOITER_UNLIM:
             return
         self._waited += STEP_S
-        hold = item.params[0] if item.command in (WAYPOINT, LOITER_TIME, DELAY) else 0.0
+        hold = item.params[0] if item.command in (mav.WAYPOINT, mav.LOITER_TIME, mav.DELAY) else 0.0
         if self._waited <= hold + self._lost_s(item):
             return
-        if item.command == TAKEOFF:
+        if item.command == mav.TAKEOFF:
             self.landed = Landed.IN_AIR
             times = self.motion.airframe.times
             if times is not None:
@@ -426,7 +412,7 @@ class MissionFlight:
         motion, times = self.motion, self.motion.airframe.times
         if times is None or motion.target is None:
             return 0.0
-        if item.command == TAKEOFF:
+        if item.command == mav.TAKEOFF:
             return times.takeoff_s - max(times.takeoff_below_s, _OWN_TAKEOFF_S) + times.set_off_s
         came, goes = _step(motion.came_from, motion.target), _step(motion.target, self._next_place())
         if not came or not goes:
@@ -477,7 +463,7 @@ class MissionFlight:
         if motion.up > 0.05:
             return
         in_mission = self.mode == self.modes.mission and self._ends_mission
-        landing = in_mission and self.store.items[self.seq].command in LANDINGS
+        landing = in_mission and self.store.items[self.seq].command in mav.LANDINGS
         if in_mission and self.autopilot is Autopilot.ARDUPILOT and not landing:
             self._reach(self.seq)  # RTL is reached, LAND is not
             self._finish()

@@ -5,17 +5,8 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect
-from gcs_plugin.mission.exchange import (
-    ACCEPTED,
-    CANCELLED,
-    DENIED,
-    ERROR,
-    INVALID_SEQUENCE,
-    NO_SPACE,
-    UNSUPPORTED,
-    UNSUPPORTED_FRAME,
-    Address,
-)
+from gcs_plugin.mission import exchange
+from gcs_plugin.mission.exchange import Address
 from gcs_plugin.mission.geofence import FENCE
 from gcs_plugin.mission.items import FRAME_GLOBAL, GIMBAL_CLAIM, JUMP, TAKEOFF, WAYPOINT, MissionItem
 from orthoswarm.config import DEFAULT
@@ -69,7 +60,7 @@ class MissionStore:
         if getattr(message, "mission_type", _MISSION) == FENCE:
             return self._fence(message, sender, now)
         if getattr(message, "mission_type", _MISSION) != _MISSION:
-            return [self._ack(sender, UNSUPPORTED, int(message.mission_type))]
+            return [self._ack(sender, exchange.UNSUPPORTED, int(message.mission_type))]
         match message.get_type():
             case "MISSION_COUNT":
                 return self._count(int(message.count), sender, now)
@@ -77,7 +68,9 @@ class MissionStore:
                 return self._item(message, sender, now)
             case "MISSION_REQUEST_LIST":
                 if self._transfer is not None:
-                    return [self._ack(sender, DENIED if self.autopilot is Autopilot.ARDUPILOT else ERROR)]
+                    return [
+                        self._ack(sender, exchange.DENIED if self.autopilot is Autopilot.ARDUPILOT else exchange.ERROR)
+                    ]
                 if self.autopilot is Autopilot.PX4:
                     self._sent_to, self._sent_at, self._next_sent = sender, now, 0
                 return [
@@ -89,7 +82,7 @@ class MissionStore:
                 self._sent_to = None
             case "MISSION_CLEAR_ALL":
                 self.clear()
-                return [self._ack(sender, ACCEPTED)]
+                return [self._ack(sender, exchange.ACCEPTED)]
         return []
 
     def tick(self, now: float) -> list[Message]:
@@ -100,7 +93,7 @@ class MissionStore:
         again, give_up = _TIMING[self.autopilot]
         if now - transfer.heard_at >= give_up:
             self._transfer = None
-            return [self._ack(transfer.partner, CANCELLED)] if self.autopilot is Autopilot.ARDUPILOT else []
+            return [self._ack(transfer.partner, exchange.CANCELLED)] if self.autopilot is Autopilot.ARDUPILOT else []
         return self._ask(transfer, now) if now - transfer.asked_at >= again else []
 
     def rebooted(self) -> None:
@@ -123,10 +116,10 @@ class MissionStore:
                 return []
             if seq not in (self._next_sent, self._next_sent - 1):
                 self._sent_to = None
-                return [self._ack(to, ERROR)]
+                return [self._ack(to, exchange.ERROR)]
             self._sent_at, self._next_sent = now, seq + 1
         if seq >= len(self.items) or self._transfer is not None:
-            return [self._ack(to, ERROR)]
+            return [self._ack(to, exchange.ERROR)]
         return [self.items[seq].message(seq, to.system, to.component)]
 
     def _fence(self, message: Message, to: Address, now: float) -> list[Message]:
@@ -140,7 +133,7 @@ class MissionStore:
                 return []
             case "MISSION_COUNT" if message.count == 0:
                 self.fence = []
-                return [self._ack(to, ACCEPTED, FENCE)]
+                return [self._ack(to, exchange.ACCEPTED, FENCE)]
             case "MISSION_COUNT":
                 transfer = _Transfer(partner=to, count=int(message.count), wanted=0, asked_at=now, heard_at=now)
                 self._fence_transfer = transfer
@@ -149,25 +142,25 @@ class MissionStore:
                 transfer.wanted += 1
                 if transfer.wanted == transfer.count:
                     self.fence, self._fence_transfer = transfer.items, None
-                    return [self._ack(to, ACCEPTED, FENCE)]
+                    return [self._ack(to, exchange.ACCEPTED, FENCE)]
             case _:
-                return [self._ack(to, UNSUPPORTED, FENCE)]
+                return [self._ack(to, exchange.UNSUPPORTED, FENCE)]
         return [dialect.MAVLink_mission_request_int_message(to.system, to.component, transfer.wanted, FENCE)]
 
     def _count(self, count: int, sender: Address, now: float) -> list[Message]:
         transfer = self._transfer
         if transfer is not None and transfer.partner != sender:
-            return [self._ack(sender, DENIED)]
+            return [self._ack(sender, exchange.DENIED)]
         if transfer is not None and self.autopilot is Autopilot.PX4:
-            return self._ask(transfer, now) if transfer.wanted == 0 else [self._ack(sender, ERROR)]
+            return self._ask(transfer, now) if transfer.wanted == 0 else [self._ack(sender, exchange.ERROR)]
         if self._sent_to is not None and now - self._sent_at < _TIMING[Autopilot.PX4][1]:
-            return [self._ack(sender, ERROR)]  # PX4 is still handing its mission out
+            return [self._ack(sender, exchange.ERROR)]  # PX4 is still handing its mission out
         if count > DEFAULT.times(self.autopilot.value).most_items:
-            return [self._ack(sender, NO_SPACE)]
+            return [self._ack(sender, exchange.NO_SPACE)]
         if count == 0:
             self.items = []
             self.generation += 1
-            return [self._ack(sender, ACCEPTED)]
+            return [self._ack(sender, exchange.ACCEPTED)]
         self._transfer = _Transfer(partner=sender, count=count, wanted=0, asked_at=now, heard_at=now)
         return self._ask(self._transfer, now)
 
@@ -182,12 +175,12 @@ class MissionStore:
     def _item(self, message: Message, sender: Address, now: float) -> list[Message]:
         transfer = self._transfer
         if transfer is None or transfer.partner != sender:
-            return [self._ack(sender, ERROR)]
+            return [self._ack(sender, exchange.ERROR)]
         if message.seq != transfer.wanted:
-            return [self._ack(sender, INVALID_SEQUENCE)]
+            return [self._ack(sender, exchange.INVALID_SEQUENCE)]
         item = MissionItem.of(message)
         code = self._check(item, transfer.count)
-        if code != ACCEPTED:
+        if code != exchange.ACCEPTED:
             self._transfer = None
             return [self._ack(sender, code)]
         if self.autopilot is Autopilot.ARDUPILOT:  # written at once, so that a broken upload leaves a mixture
@@ -203,7 +196,7 @@ class MissionStore:
             self.items = transfer.items
         self._transfer, self.stored_at = None, now
         self.generation += 1
-        return [self._ack(sender, ACCEPTED)]
+        return [self._ack(sender, exchange.ACCEPTED)]
 
     def _write(self, seq: int, item: MissionItem) -> None:
         self.items[seq : seq + 1] = [item]
@@ -223,9 +216,9 @@ class MissionStore:
         """MAV_MISSION_RESULT for an item, in the order in which ArduPilot looks at it."""
         ardupilot = self.autopilot is Autopilot.ARDUPILOT
         if item.command not in _COMMANDS and (ardupilot or item.command != GIMBAL_CLAIM):
-            return UNSUPPORTED
+            return exchange.UNSUPPORTED
         if item.frame not in (_FRAMES if ardupilot else _FRAMES_PX4):
-            return UNSUPPORTED_FRAME
+            return exchange.UNSUPPORTED_FRAME
         for index, value in enumerate(item.params):
             if math.isnan(value) and (ardupilot or index == 0):
                 return 6 + index
@@ -237,8 +230,8 @@ class MissionStore:
             if not abs(item.z) < 1e6:
                 return 12
         if item.command == JUMP and not 1 <= item.params[0] < count:
-            return ERROR
-        return ACCEPTED
+            return exchange.ERROR
+        return exchange.ACCEPTED
 
     def _ack(self, to: Address, code: int, kind: int = 0) -> Message:
         return dialect.MAVLink_mission_ack_message(to.system, to.component, code, kind)

@@ -12,12 +12,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
-from gcs_plugin.links.file_transfer import payload_of
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect
 from gcs_plugin.mission.exchange import Address
 from gcs_plugin.mission.flight_modes import modes_of
 from gcs_plugin.mission.items import FRAME_GLOBAL, WAYPOINT, MissionItem
-from gcs_plugin.sim.file_server import FileServer
 from gcs_plugin.sim.mission_flight import RTL_HEIGHT_M, Landed, MissionFlight, MissionState, TakenPicture
 from gcs_plugin.sim.mission_store import MissionStore
 from gcs_plugin.sim.multirotor import STEP_S, Airframe, Chart, VehiclePose
@@ -73,7 +71,6 @@ class SimVehicle:
         wipes: True for ArduPilot's simulation with -w, which loses the mission at each restart.
         tx_bytes_s: capacity of its radio. Streams beyond that are skipped, as ArduPilot does; heartbeats and answers
             are sent first.
-        files: what it serves over MAVLink FTP; None for one without.
         withheld: ids of messages that it does not stream, whatever rate it is asked for.
         used_s: for how long its motors have used its battery, seconds.
         second_battery: what is left in a second one, 0 to 1; None for one without.
@@ -91,7 +88,6 @@ class SimVehicle:
     arms: bool = True
     wipes: bool = False
     tx_bytes_s: float = math.inf
-    files: FileServer | None = None
     on_exposure: "Callable[[SimVehicle, TakenPicture], None] | None" = None
     flight: MissionFlight = field(init=False)
     store: MissionStore = field(init=False)
@@ -155,8 +151,6 @@ class SimVehicle:
         self._off_until = now + silence_s
         self.reboots += 1
         self.store.rebooted()
-        if self.files is not None:
-            self.files.rebooted()
         if self.wipes:
             self.store.clear()
         flight = self.flight
@@ -187,9 +181,6 @@ class SimVehicle:
             return []
         if kind.startswith("MISSION_") and kind != "MISSION_SET_CURRENT":
             return self.store.feed(message, sender, now)
-        if kind == "FILE_TRANSFER_PROTOCOL" and self.files is not None:
-            request = payload_of(message)
-            return [] if request is None else [self.files.answer(request).message(sender.system, sender.component)]
         if kind == "PARAM_REQUEST_READ":
             return _parameter_answer(self.parameters, str(message.param_id).strip("\x00"), self.autopilot)
         if kind == "MISSION_SET_CURRENT":

@@ -89,11 +89,7 @@ async def json_body(request: Request) -> dict[str, Any]:
 
 
 async def body_of(request: Request, most_bytes: int) -> bytes:
-    """The body of a request.
-
-    Raises:
-        HTTPException: it is larger than that, too slow, or the client disconnected.
-    """
+    """The body of a request; raises HTTPException: it is larger than that, too slow, or the client disconnected."""
     request._receive = bounded(request.receive, most_bytes)
     try:
         async with asyncio.timeout(_BODY_S):

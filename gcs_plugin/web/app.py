@@ -21,14 +21,13 @@ from gcs_plugin.daemon.layers.web_tiles import TileAddress
 from gcs_plugin.daemon.store.frame_rows import stage_counts
 from gcs_plugin.daemon.store.job_rows import job_counts
 from gcs_plugin.web.answers import JsonAnswer, in_thread, install_error_answers, json_body, parse_json
-from gcs_plugin.web.areas import read_area
 from gcs_plugin.web.assets import Assets, Packed
 from gcs_plugin.web.command_routes import CommandRoutes
 from gcs_plugin.web.event_stream import Standstill, stream_events
 from gcs_plugin.web.guard import Access, Guard
 from gcs_plugin.web.map_services import MapServices
 from gcs_plugin.web.people_routes import PeopleRoutes
-from gcs_plugin.web.uploads import UploadRoute
+from gcs_plugin.web.uploads import UploadRoute, read_area
 from orthoswarm import __version__
 from orthoswarm.compute.workers import peak_rss_mb
 from orthoswarm.export.tactical.places import feature
@@ -90,11 +89,7 @@ def calls(daemon: Daemon) -> list[Call]:
 
 
 class HttpRoutes:
-    """The functions of the routes.
-
-    Args:
-        daemon: the daemon that they call.
-    """
+    """The functions of the routes; `daemon`: the daemon that they call."""
 
     def __init__(self, daemon: Daemon) -> None:
         self.daemon = daemon
@@ -174,18 +169,17 @@ class HttpRoutes:
 
         `requests`: the pictures that were asked from vehicles, each with `state`, `reason`, `percent`.
         """
-        return JsonAnswer(self.daemon.coverage.document | {"requests": self.daemon.picture_requests.rows()})
+        return JsonAnswer(self.daemon.coverage.result.document | {"requests": self.daemon.picture_requests.rows()})
 
     async def cells(self, request: Request) -> Response:
         """The states of the cells as a PNG, an overlay with the `corners` of /api/coverage."""
-        data: bytes = self.daemon.coverage.png
-        if not data:
+        found = self.daemon.coverage.result
+        if not found.png:
             raise HTTPException(404, "there is no area yet; plan one, or draw it")
-        version: Any = self.daemon.coverage.document["version"]
-        headers = {"ETag": f'"{version}"', "Cache-Control": "no-cache"}
-        if f'"{version}"' in request.headers.get("if-none-match", ""):
+        headers = {"ETag": f'"{found.document["version"]}"', "Cache-Control": "no-cache"}
+        if headers["ETag"] in request.headers.get("if-none-match", ""):
             return Response(status_code=304, headers=headers)
-        return Response(data, media_type="image/png", headers=headers)
+        return Response(found.png, media_type="image/png", headers=headers)
 
     def _trusted(self) -> tuple[int, Path]:
         """Where not to trust the map: the raster of the last export, and its version, 0 if there is none."""
@@ -221,7 +215,7 @@ class HttpRoutes:
 
     async def gaps(self) -> Response:
         """The gaps as GeoJSON, as `orthoswarm coverage` writes them; `orthoswarm plan --gaps` reads them."""
-        return JsonAnswer(self.daemon.coverage.gaps, media_type="application/geo+json")
+        return JsonAnswer(self.daemon.coverage.result.gaps, media_type="application/geo+json")
 
     # -- commands -------------------------------------------------------------------------------------------------
 
@@ -471,7 +465,7 @@ def prometheus(daemon: Daemon, uploads_waiting: int = 0) -> str:
         [({"cause": cause}, count) for cause, count in daemon.refused.counts.items()],
     )  # fmt: skip
     single("uploads_waiting", "gauge", "Posted pictures that wait for their turn.", uploads_waiting)
-    covered = daemon.coverage.document
+    covered = daemon.coverage.result.document
     names = ("seen", "poor", "missed", "planned")
     shares = {name: covered[f"{name}_share"] for name in names}  # type: ignore[literal-required]
     metric(

@@ -98,11 +98,7 @@ def _made(names: list[str]) -> tuple[bytes, bytes]:
 
 
 def server_context(certificate: Path, key: Path) -> ssl.SSLContext:
-    """TLS 1.2 and later, for a certificate (chain) and its key, PEM files.
-
-    Raises:
-        InputError: they cannot be used.
-    """
+    """TLS 1.2 and later, for a certificate (chain) and its key, PEM files; raises InputError: they cannot be used."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     context.set_ciphers(_CIPHERS)

@@ -22,7 +22,6 @@ from fastapi import HTTPException, Request, Response
 
 from gcs_plugin.config import COMMAND
 from gcs_plugin.daemon.daemon import Daemon
-from gcs_plugin.daemon.store.daemon_events import CommandDone
 from gcs_plugin.daemon.store.people_rows import Deed, Person
 from gcs_plugin.daemon.takeoffs import names_of
 from gcs_plugin.daemon.vehicles import VehicleLinks
@@ -180,7 +179,7 @@ class CommandRoutes:
 
     def _told(self, rows: Rows) -> Rows:
         for row in rows:
-            self._daemon.events.publish(CommandDone(row))
+            self._daemon.events.tell("command", **row)
         return rows
 
     def _upload(self, vehicle: str, verb: str, issue: Issue, body: dict[str, Any]) -> dict[str, Any]:

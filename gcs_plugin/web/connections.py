@@ -65,11 +65,7 @@ def open_files() -> int:
 
 
 class Connections:
-    """The open connections by client.
-
-    Args:
-        limits: see ConnectionLimits.
-    """
+    """The open connections by client; `limits`: see ConnectionLimits."""
 
     def __init__(self, limits: ConnectionLimits) -> None:
         self.limits = limits

@@ -35,11 +35,7 @@ def clock_with_sleep() -> float:
 
 
 class Standstill:
-    """Watches the event loop in which `run` runs.
-
-    Args:
-        clock: seconds.
-    """
+    """Watches the event loop in which `run` runs; `clock`: seconds."""
 
     def __init__(self, clock: Callable[[], float] = clock_with_sleep) -> None:
         self._clock = clock

@@ -22,11 +22,7 @@ _WORLD: Final = (-180.0, -85.0511, 180.0, 85.0511)
 
 
 class MapServices:
-    """The routes.
-
-    Args:
-        daemon: whose layers they describe.
-    """
+    """The routes; `daemon`: whose layers they describe."""
 
     def __init__(self, daemon: Daemon) -> None:
         self._daemon = daemon

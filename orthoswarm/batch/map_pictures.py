@@ -1,9 +1,11 @@
 """The rasters of a run: selection of the frames of each, and rendering as COGs."""
 
+import os
 import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any, Final
 
 import numpy as np
 
@@ -16,6 +18,7 @@ from orthoswarm.export.cog import write_cog
 from orthoswarm.export.footprint_layer import write_seamlines
 from orthoswarm.export.product_files import describe_frame
 from orthoswarm.export.value_raster import write_confidence
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import last_time
 from orthoswarm.model.geo import GroundGrid
@@ -23,12 +26,19 @@ from orthoswarm.model.placement import PlacedFrame, Refinement, Solution, Terrai
 from orthoswarm.mosaic.confidence import confidence, drawn_cells
 from orthoswarm.mosaic.extent import drawn_window, ground_level, placed_bounds
 from orthoswarm.mosaic.footprint import default_gsd, rejection
+from orthoswarm.mosaic.kernels.downsampling import reduction
 from orthoswarm.mosaic.oblique import stray_warning, strays, weakly_held_warning
 from orthoswarm.mosaic.radiometry import NO_MAP_TONE, estimate_fields, tone_warning
 from orthoswarm.mosaic.realtime import mosaic
 from orthoswarm.mosaic.renderer import Layer, RenderStats, Seams, render, render_layers
+from orthoswarm.raster.grey_pictures import working_factor
 from orthoswarm.raster.height_model import DEM_MOST_NODES, HeightModel
 from orthoswarm.refine.flight.record_findings import NAMED_MOST
+
+_PREVIEW_PX: Final = 4000
+"""Pixels along the path of a real-time picture that refined ones follow: as much as is looked at meanwhile."""
+
+_QUICK: Final = 4.0  # ground pixel of a quick look, in those of the map
 
 _Map = tuple[Sequence[PlacedFrame], Terrain | None]
 """Frames and the ground under them: what a map is drawn from."""
@@ -36,7 +46,9 @@ _Map = tuple[Sequence[PlacedFrame], Terrain | None]
 
 def refined_pictures(run: RunContext, state: RunState, refinement: Refinement | None) -> list[PlacedFrame]:
     """Draw coarse.tif and orthoimage.tif; returns the frames as last placed."""
+    coarser = _QUICK if run.options.quick else 1.0
     if refinement is None:
+        state.gsd_m *= coarser
         placed = _looking_down(run, state, state.recorded.placed)
         name = ORTHOIMAGE if run.options.until == "fine" else COARSE
         with run.clock.stage(f"final: {name.removesuffix('.tif')}", len(placed)):
@@ -62,6 +74,7 @@ def refined_pictures(run: RunContext, state: RunState, refinement: Refinement | 
     state.warnings += weakly_held_warning(fine, state.odd)
     if run.options.gsd_m is None:
         state.gsd_m = default_gsd([p.camera for p in fine], ground_level(fine, terrain))
+    state.gsd_m *= coarser
     if run.options.gains:
         with run.clock.stage("final: gains", len(fine)):
             tone = state.basemap if run.options.tone == "map" and with_map and on_map else None
@@ -109,22 +122,24 @@ def _both(run: RunContext, state: RunState, coarse: _Map, fine: _Map) -> None:
     coarse_ground, fine_ground = coarse[1] or Terrain.flat(), fine[1] or Terrain.flat()
     with (
         run.clock.stage("final: coarse and orthoimage", len(fine[0])) as stage,
-        _canvas(run, ORTHOIMAGE, fine[0], fine_ground, state) as second,
+        _canvas(run, ORTHOIMAGE, fine[0], fine_ground, state, state.gsd_m) as second,
     ):
-        with _canvas(run, COARSE, coarse[0], coarse_ground, state) as first:
+        with _canvas(run, COARSE, coarse[0], coarse_ground, state, state.gsd_m) as first:
+            reading, gains = _Reading(state.gsd_m, [*coarse[0], *fine[0]], fine_ground), state.gains
+            drawn = [reading.frames(frames) for frames in (coarse[0], fine[0])]
             layers = [
-                Layer(frames=coarse[0], terrain=coarse_ground, canvas=first, gains=state.gains),
-                Layer(frames=fine[0], terrain=fine_ground, canvas=second, gains=state.gains, seams=_seams(run, state)),
+                Layer(frames=drawn[0], terrain=coarse_ground, canvas=first, gains=gains),
+                Layer(frames=drawn[1], terrain=fine_ground, canvas=second, gains=gains, seams=_seams(run, state)),
             ]
-            drawn = partial(run.progress, "drawing orthoimage")
-            stats = render_layers(layers, read=state.read_rgb(), parts=state.parts, run=run.drawers.map, progress=drawn)
+            stats = render_layers(layers, **reading.how(run, state, "drawing orthoimage"))
             _write(run, first, COARSE, coarse[0])
         _write(run, second, ORTHOIMAGE, fine[0])
         _write_about(run, state, second, fine[0], fine_ground)
     run.space.clear_scratch()
     state.drawn = stats[1].drawn
-    run.space.remember(ORTHOIMAGE, (stats[1].rejected, state.drawn, state.trust, stage))
-    run.space.remember(COARSE, (stats[0].rejected, stats[0].drawn, {}, replace(stage, wall_s=0.0, cpu_s=0.0)))
+    if not run.options.quick:
+        run.space.remember(ORTHOIMAGE, (stats[1].rejected, state.drawn, state.trust, stage))
+        run.space.remember(COARSE, (stats[0].rejected, stats[0].drawn, {}, replace(stage, wall_s=0.0, cpu_s=0.0)))
     for s in stats:
         state.leave_out(s.rejected, fine[0])
 
@@ -142,7 +157,8 @@ def _picture(
         with run.clock.stage(f"final: {label}", len(placed)) as stage:
             stats = draw(run, name, placed, terrain or Terrain.flat(), state)
         rejected, state.drawn = stats.rejected, stats.drawn
-        run.space.remember(name, (rejected, state.drawn, state.trust, stage))
+        if not run.options.quick:
+            run.space.remember(name, (rejected, state.drawn, state.trust, stage))
     state.leave_out(rejected, placed)
 
 
@@ -156,31 +172,16 @@ def draw(
     realtime: bool = False,
 ) -> RenderStats:
     """Render frames on their own canvas and write it as a COG."""
-    drawn = partial(run.progress, f"drawing {name.removesuffix('.tif')}")
-    with _canvas(run, name, placed, terrain, state) as canvas:
+    preview = realtime and run.options.until != "realtime" and run.options.gsd_m is None
+    gsd_m = _preview_gsd(placed) if preview else state.gsd_m
+    reading = _Reading(gsd_m, placed, terrain)
+    with _canvas(run, name, placed, terrain, state, gsd_m) as canvas:
+        how = reading.how(run, state, f"drawing {name.removesuffix('.tif')}")
         if realtime:
-            stats = mosaic(
-                placed,
-                canvas,
-                previews=state.previews,
-                read=state.read_rgb(),
-                parts=state.parts,
-                run=run.drawers.map,
-                progress=drawn,
-            )
+            stats = mosaic(reading.frames(placed), canvas, previews=state.previews, **how)
         else:
             seams = _seams(run, state) if name == ORTHOIMAGE else None
-            stats = render(
-                placed,
-                terrain,
-                canvas,
-                gains=state.gains,
-                seams=seams,
-                read=state.read_rgb(),
-                parts=state.parts,
-                run=run.drawers.map,
-                progress=drawn,
-            )
+            stats = render(reading.frames(placed), terrain, canvas, gains=state.gains, seams=seams, **how)
         _write(run, canvas, name, placed)
         if name == ORTHOIMAGE:
             _write_about(run, state, canvas, placed, terrain)
@@ -200,14 +201,56 @@ def _seams(run: RunContext, state: RunState) -> Seams | None:
     )
 
 
-def _canvas(run: RunContext, name: str, placed: Sequence[PlacedFrame], terrain: Terrain, state: RunState) -> Canvas:
+class _Reading:
+    """How pictures are read for a map: reduced as they are decoded where its pixel is coarse enough for that.
+
+    gsd_m: the map's pixel. placed: the frames. terrain: under them.
+    """
+
+    def __init__(self, gsd_m: float, placed: Sequence[PlacedFrame], terrain: Terrain) -> None:
+        heights = terrain.height(np.array([p.camera.nadir for p in placed]).reshape(-1, 2))
+        self._factor = {}
+        for p, z in zip(placed, heights.tolist(), strict=True):
+            factor, most = (
+                working_factor(p.frame),
+                reduction(gsd_m, (p.camera.position[2] - z) / p.camera.lens.focal_px),
+            )
+            while factor > most:
+                factor //= 2
+            self._factor[p.frame.image] = factor
+
+    def frames(self, placed: Sequence[PlacedFrame]) -> list[PlacedFrame]:
+        """Frames with their pictures as they are read."""
+        return [p.reduced(self._factor[p.frame.image]) for p in placed]
+
+    def how(self, run: RunContext, state: RunState, doing: str) -> dict[str, Any]:
+        """Arguments of the renderer; parts are kept of whole pictures."""
+        parts = state.parts if max(self._factor.values(), default=1) == 1 else None
+        return {
+            "read": state.read_rgb(),
+            "parts": parts,
+            "run": run.drawers.map,
+            "progress": partial(run.progress, doing),
+        }
+
+
+def _preview_gsd(placed: Sequence[PlacedFrame]) -> float:
+    """The ground pixel of the real-time picture that refined ones follow, metres."""
+    working = default_gsd([p.reduced(working_factor(p.frame)).camera for p in placed])
+    area = BoundingBox.around_points([p.camera.nadir for p in placed])
+    return max(working, area.width / _PREVIEW_PX, area.height / _PREVIEW_PX)
+
+
+def _canvas(
+    run: RunContext, name: str, placed: Sequence[PlacedFrame], terrain: Terrain, state: RunState, gsd_m: float
+) -> Canvas:
     """An empty canvas for a product of these frames."""
     low, high = float(terrain.z.min()), float(terrain.z.max())
-    usable = [p for p in placed if rejection(p.camera, float(terrain.height(p.camera.nadir)), state.gsd_m) is None]
+    usable = [p for p in placed if rejection(p.camera, float(terrain.height(p.camera.nadir)), gsd_m) is None]
     if not usable:
-        reason = rejection(placed[0].camera, low, state.gsd_m) if placed else "there is none"
+        reason = rejection(placed[0].camera, low, gsd_m) if placed else "there is none"
         raise OrthoSwarmError(f"no picture can be drawn: {reason}")
-    grid = GroundGrid.around(state.grid.epsg, placed_bounds(usable, low, high), state.gsd_m)
+    grid = GroundGrid.around(state.grid.epsg, placed_bounds(usable, low, high), gsd_m)
     folder, memory_mb = run.space.scratch(name.removesuffix(".tif")), run.options.config.compute.canvas_mb
     return Canvas.create(folder, grid, plane="frame", memory_mb=memory_mb)
 
@@ -237,10 +280,15 @@ def _write_about(
 
 
 def _copy_coarse(run: RunContext, state: RunState) -> None:
-    """Without a map the orthoimage is the coarse product, too."""
-    if (run.out / ORTHOIMAGE).exists():
-        with atomic_write(run.out / COARSE) as part:
-            shutil.copyfile(run.out / ORTHOIMAGE, part)
+    """Without a map the orthoimage is the coarse product, too: one file under both names where the disk can do that."""
+    whole, coarse = run.out / ORTHOIMAGE, run.out / COARSE
+    if whole.exists():
+        if not (coarse.exists() and coarse.samefile(whole)):
+            with atomic_write(coarse) as part:
+                try:
+                    os.link(whole, part)
+                except OSError:
+                    shutil.copyfile(whole, part)
         remove_tiles(run.out, COARSE)
     else:
         copy_tiled(run.out, ORTHOIMAGE, COARSE)

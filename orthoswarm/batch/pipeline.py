@@ -51,6 +51,7 @@ from orthoswarm.stores.listing import exists
 from orthoswarm.trajectory.legs import split_legs
 
 _SPOT_DEG: Final = 0.001  # records farther apart than 110 m are none of a vehicle that hovers
+_QUICK_LOOK: Final = "a quick look at a quarter of the detail; the same command without --quick goes on from it"
 _BESIDE_PHOTOS: Final = 15
 """Photos with a position before and after, of the same flight, that may show the ground of one without (its cost)."""
 
@@ -103,7 +104,7 @@ def run(
             state = _load(context, load)
             stage.items = len(state.ingest.frames) + len(state.ingest.rejected)
         files = options.basemap, options.dem, options.control, options.checkpoints
-        if space.begin(run_key(state.ingest.frames, options, *files)):
+        if space.begin(run_key(state.ingest.frames, options, *files)) and not space.recall("quick look", False):
             state.warnings.append("this run was interrupted before and was continued")
         placed = _realtime(context, state)
         refinement = None
@@ -117,10 +118,15 @@ def run(
                 placed = map_pictures.refined_pictures(context, state, refinement)
             else:
                 state.leave_out(state.undrawn, state.recorded.placed)
+        if options.quick:
+            state.warnings.append(_QUICK_LOOK)
         report = run_report.write_products(context, state, placed, refinement)
         if publish is not None and state.fault is None:
             publish()
-        space.complete()
+        if options.quick:
+            space.remember("quick look", True)
+        else:
+            space.complete()
     if state.fault is not None:
         stands = f"{REALTIME} stands, but there is no orthoimage"
         if publish is not None:

@@ -75,6 +75,7 @@ class MapOptions:
             as of evaluation.checkpoints). pixel_scale: pixels of the photos to one of those in which they were marked.
         covariance: write the covariance of each camera's position and rotation to frames.jsonl.
         tiles: write rasters in tiles with a STAC collection: "yes", "no", or "auto" by their pixels.
+        quick: draw refined maps at a quarter of the detail, and keep what a run without it goes on from.
         config: the settings of the stages.
     """
 
@@ -94,6 +95,7 @@ class MapOptions:
     pixel_scale: float = 1.0
     covariance: bool = False
     tiles: Tiles = "auto"
+    quick: bool = field(default=False, repr=False)  # no part of a run's key: the other run is the same one
     config: Config = DEFAULT
 
 

@@ -17,29 +17,59 @@ Bytes = NDArray[np.uint8]
 FACTORS = (8, 64)
 
 
+_PAIR = np.uint32(0x00FF00FF)
+_MOST = 16  # side of a block whose sums fit into 16 bits
+
+
+@in_place_kernel
+def _reduce_partly_drawn(source, factor, i, j, target):  # type: ignore[no-untyped-def]
+    """One block's mean over what is drawn of it."""
+    red = green = blue = weight = np.int64(0)
+    for y in range(i * factor, (i + 1) * factor):
+        for x in range(j * factor, (j + 1) * factor):
+            pixel = np.int64(source[y, x])
+            a = pixel >> 24
+            red += a * (pixel & 255)
+            green += a * ((pixel >> 8) & 255)
+            blue += a * ((pixel >> 16) & 255)
+            weight += a
+    half = weight >> 1
+    if weight > 0:
+        target[i, j, 0] = (red + half) // weight
+        target[i, j, 1] = (green + half) // weight
+        target[i, j, 2] = (blue + half) // weight
+        # at least 1, so that a lone pixel is not lost to a reader that asks "is anything there"
+        target[i, j, 3] = max(1, (weight + factor * factor // 2) // (factor * factor))
+    else:
+        target[i, j, 0] = target[i, j, 1] = target[i, j, 2] = target[i, j, 3] = 0
+
+
 @in_place_kernel
 def _reduce(source, factor, target):  # type: ignore[no-untyped-def]
+    """Means of blocks; two channels of a packed pixel are summed at once in the halves of a word."""
     rows, cols = target.shape[0], target.shape[1]
-    none = np.int64(0)
+    none, eight, sixteen, low = np.uint32(0), np.uint32(8), np.uint32(16), np.uint32(0xFFFF)
+    pixels, shift = np.uint32(factor * factor), none
+    while np.uint32(1) << shift < pixels:
+        shift += np.uint32(1)
+    half = pixels >> np.uint32(1)
     for i in range(rows):
         for j in range(cols):
-            red, green, blue, weight = none, none, none, none
+            red_blue, green_alpha = none, none
             for y in range(i * factor, (i + 1) * factor):
-                for x in range(j * factor, (j + 1) * factor):
-                    a = np.int64(source[y, x, 3])
-                    red += a * source[y, x, 0]
-                    green += a * source[y, x, 1]
-                    blue += a * source[y, x, 2]
-                    weight += a
-            if weight > 0:
-                half = weight >> 1
-                target[i, j, 0] = (red + half) // weight
-                target[i, j, 1] = (green + half) // weight
-                target[i, j, 2] = (blue + half) // weight
-                # at least 1, so that a lone pixel is not lost to a reader that asks "is anything there"
-                target[i, j, 3] = max(1, (weight + factor * factor // 2) // (factor * factor))
-            else:
+                row = source[y, j * factor : (j + 1) * factor]
+                for x in range(row.shape[0]):
+                    red_blue += row[x] & _PAIR
+                    green_alpha += (row[x] >> eight) & _PAIR
+            if green_alpha >> sixteen == np.uint32(255) * pixels:
+                target[i, j, 0] = ((red_blue & low) + half) >> shift
+                target[i, j, 1] = ((green_alpha & low) + half) >> shift
+                target[i, j, 2] = ((red_blue >> sixteen) + half) >> shift
+                target[i, j, 3] = 255
+            elif green_alpha >> sixteen == none:
                 target[i, j, 0] = target[i, j, 1] = target[i, j, 2] = target[i, j, 3] = 0
+            else:
+                _reduce_partly_drawn(source, factor, i, j, target)
 
 
 def reduce_rgba(rgba: Bytes, factor: int) -> Bytes:
@@ -47,10 +77,12 @@ def reduce_rgba(rgba: Bytes, factor: int) -> Bytes:
 
     Args:
         rgba: uint8 (rows, columns, 4), both sides multiples of factor.
-        factor: side of a block in pixels.
+        factor: side of a block in pixels, a power of two.
     """
+    if factor > _MOST:
+        return reduce_rgba(reduce_rgba(rgba, _MOST), factor // _MOST)
     out = np.empty((rgba.shape[0] // factor, rgba.shape[1] // factor, 4), np.uint8)
-    _reduce(np.ascontiguousarray(rgba), factor, out)
+    _reduce(np.ascontiguousarray(rgba).view(np.uint32)[..., 0], factor, out)
     return out
 
 

@@ -32,6 +32,16 @@ def listed() -> dict[str, list[str]]:
     return dict(lines)
 
 
+def load_kernels(*rooms: str) -> None:
+    """Load the kernels of rooms ("mosaic.kernels") before they are needed, where the installation has them compiled."""
+    from numba.core.sigutils import normalize_signature
+
+    ours = tuple(f"orthoswarm.{room}." for room in rooms) if MADE_FOR.exists() else ()
+    for module, lines in listed().items():
+        for name, types in (line.split(" ", 1) for line in lines if module.startswith(ours)):
+            getattr(importlib.import_module(module), name).compile(normalize_signature(f"({types},)")[0])
+
+
 def missing() -> tuple[int, int]:
     """How many of the listed kernels are not compiled yet, and how many there are."""
     lines = [(module, line) for module, lines in listed().items() for line in lines]

@@ -6,7 +6,7 @@ pitch -90 deg looks straight down and yaw is the azimuth of the picture's up dir
 Sign and axis conventions are defined only in this module.
 """
 
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -88,6 +88,11 @@ class Lens:
     def is_pinhole(self) -> bool:
         """True without radial distortion."""
         return self.k1 == 0.0 and self.k2 == 0.0 and self.k3 == 0.0
+
+    def reduced(self, factor: int) -> "Lens":
+        """The lens of the picture averaged over blocks of factor x factor, which divides its sides."""
+        width, height, focal_px = self.width // factor, self.height // factor, self.focal_px / factor
+        return replace(self, width=width, height=height, focal_px=focal_px, cx=self.cx / factor, cy=self.cy / factor)
 
     def matrix(self) -> Array:
         """The 3x3 calibration matrix (undistorted pinhole)."""

@@ -36,6 +36,12 @@ class PlacedFrame:
     # adjustment, without errors common to all frames; None where it is not known
     pose_covariance: NDArray[np.float32] | None = field(default=None, compare=False)
 
+    def reduced(self, factor: int) -> "PlacedFrame":
+        """The same with its picture averaged over blocks of factor x factor pixels."""
+        return (
+            self if factor == 1 else replace(self, camera=replace(self.camera, lens=self.camera.lens.reduced(factor)))
+        )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Leg:

@@ -13,30 +13,41 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.canvas.tile_store import Key, Tile, TileStore
+from orthoswarm.canvas.tile_store import Key, TileStore
 from orthoswarm.model.arrays import Bytes, Floats, Indices, Ints
-from orthoswarm.model.errors import OrthoSwarmError, RunInterruptedError
+from orthoswarm.model.errors import OrthoSwarmError, RunInterruptedError, StorageError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.kernels.downsampling import bearable, reduced, reduced_exactly
 from orthoswarm.mosaic.kernels.drawn_heights import heights
-from orthoswarm.mosaic.kernels.pixel_sampling import AFTER, BEFORE, WEIGHTS, blend, drawn_again, place, widen
+from orthoswarm.mosaic.kernels.pixel_sampling import (
+    AFTER,
+    BEFORE,
+    SPOT_PX,
+    WEIGHTS,
+    blend,
+    drawn_again,
+    place,
+    place_listed,
+    widen,
+)
 from orthoswarm.mosaic.kernels.render_arrays import Shots
 from orthoswarm.mosaic.seam_labels import label_tile, label_windows, write_labels
 from orthoswarm.mosaic.seams.feather import labels_around, mix, transition
 from orthoswarm.mosaic.seams.leveling import TileColors, TileFactors, tile_colors
-from orthoswarm.mosaic.seams.previews import write_preview
+from orthoswarm.mosaic.seams.previews import COLUMNS, ROWS, write_preview
+from orthoswarm.mosaic.seams.seam_pixels import SeamPixels
 from orthoswarm.mosaic.seams.seam_tiles import SeamCells, seam_labels
 from orthoswarm.raster.picture_file import PictureError
 from orthoswarm.raster.picture_parts import Box, Part, PictureParts
 from orthoswarm.stores.local_copies import copy_ahead
 
-Read = Callable[[Path], Bytes]
+Read = Callable[[Path, int], Bytes]
+"""Reads a picture, uint8 (rows, columns, 3), reduced to the longer side that is given, see picture_file.read_rgb."""
 
 THUMBNAIL = (12, 16)  # rows and columns of a picture's thumbnail
 TWICE_M: Final = 0.5  # what a picture shows at places farther apart than this is drawn twice, metres
 _NUMBERS = 8  # frame, row and column of the tile, rows and columns of the window (4), pixels
-_SPOT_PX: Final = 2  # pixels of a picture along each side that count as one
 _TILES_MB: Final = 64.0  # memory that a drawing task keeps of the tiles that it writes
 
 
@@ -50,14 +61,16 @@ class TilePlace:
 
     def store(self) -> TileStore:
         """The tiles; only a few are mapped into memory at a time, since a task goes from tile to tile."""
-        return self._store(self.folder)
+        return TileStore(self.folder, tile_px=self.tile_px, dtype=np.int32, memory_mb=_TILES_MB)
 
-    def other_pictures(self) -> TileStore:
-        """Tiles of the second picture's pixels near each seam, in a folder beside the others."""
-        return self._store(self.folder / "seams")
+    @property
+    def seams(self) -> Path:
+        """Folder of the files of `seam_file`."""
+        return self.folder / "seams"
 
-    def _store(self, folder: Path) -> TileStore:
-        return TileStore(folder, tile_px=self.tile_px, dtype=np.int32, memory_mb=_TILES_MB)
+    def seam_file(self, key: Key) -> Path:
+        """The file of a tile's pixels near seams, see SeamPixels."""
+        return self.seams / f"{key[0]:06d}" / f"{key[1]:06d}"
 
     def corner(self, key: Key) -> tuple[float, float]:
         """West and north of a tile."""
@@ -88,6 +101,11 @@ class Window(NamedTuple):
     col0: int
     col1: int
     pixels: int
+
+    @property
+    def is_listed(self) -> bool:
+        """Whether its pixels are those of the tile's SeamPixels."""
+        return self.row1 == self.row0
 
     @classmethod
     def of(cls, key: Key, box: NDArray[np.integer]) -> "Window":
@@ -203,18 +221,15 @@ def feather_pass(task: FeatherTask) -> list[tuple[int, Window]]:
 
     To be called once all tiles are labelled.
     """
-    other, _ = transition(labels_around(task.place.store(), task.key, task.width_px), task.width_px)
+    other, share = transition(labels_around(task.place.store(), task.key, task.width_px), task.width_px)
     rows, cols = task.place.shape(task.key)
-    other = np.ascontiguousarray(other[:rows, :cols])
-    wanted = np.unique(other[other > 0])
-    if len(wanted) == 0:
-        return []
-    tile = task.place.other_pictures().get(task.key, create=True)
-    assert tile is not None
-    tile.plane[:rows, :cols] = other
-    local = np.where(other > 0, np.searchsorted(wanted, other) + 1, 0).astype(np.int32)
-    boxes = label_windows(local, len(wanted))
-    return [(int(mark) - 1, Window.of(task.key, box)) for mark, box in zip(wanted, boxes)]
+    other[rows:], other[:, cols:] = 0, 0
+    try:
+        near = SeamPixels.create(task.place.seam_file(task.key), other, share)
+    except OSError as error:
+        raise StorageError(f"the seams cannot be written ({error.strerror}); free some disk space") from None
+    found = [] if near is None else near.counts()
+    return [(label - 1, Window(task.key, 0, 0, 0, 0, pixels)) for label, pixels in found]
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,35 +245,30 @@ def color_pass(task: ColorTask) -> tuple[Key, TileColors]:
     """What a tile shows by cell, and at its seams, once all are drawn."""
     tile = task.place.store().get(task.key)
     assert tile is not None
-    return task.key, tile_colors(task.key, tile, task.place.other_pictures().get(task.key), task.cell_px)
+    return task.key, tile_colors(task.key, tile, SeamPixels.open(task.place.seam_file(task.key)), task.cell_px)
 
 
 @dataclass(frozen=True, slots=True)
 class FinishTask:
     """Level and mix a tile.
 
-    place: where. key: the tile. factors: of its pictures, None to leave them. width_px: how far from a seam pictures
-    are mixed, 0 not to.
+    place: where. key: the tile. factors: of its pictures, None to leave them. mixed: whether they are mixed near seams.
     """
 
     place: TilePlace
     key: Key
     factors: TileFactors | None
-    width_px: int
+    mixed: bool
 
 
 def finish_pass(task: FinishTask) -> None:
     """Level the pictures of a tile and mix them near its seams, once all are drawn."""
-    store = task.place.store()
-    tile, second = store.get(task.key), task.place.other_pictures().get(task.key)
+    tile, near = task.place.store().get(task.key), SeamPixels.open(task.place.seam_file(task.key))
     assert tile is not None
     if task.factors is not None:
-        for drawn in (tile, second):
-            if drawn is not None:
-                task.factors.apply(drawn)
-    if second is not None and task.width_px:
-        other, share = transition(labels_around(store, task.key, task.width_px), task.width_px)
-        mix(tile.rgba, second.plane, second.rgba, other, share)
+        task.factors.apply(tile, near)
+    if near is not None and task.mixed:
+        mix(tile.packed, near.index, near.share, near.colors)
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,7 +285,7 @@ def preview_pass(task: PreviewTask) -> None:
     copy_ahead(path for path, _ in task.pictures)
     for path, row in task.pictures:
         with contextlib.suppress(PictureError):
-            write_preview(task.previews, row, task.read(path))
+            write_preview(task.previews, row, task.read(path, max(ROWS, COLUMNS)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -344,7 +354,6 @@ class _Ground:
 
     def __init__(self, layer: TaskLayer) -> None:
         self.layer, self.store = layer, layer.place.store()
-        self.second = layer.place.other_pictures()
         self.lattices = {key: layer.place.heights(key, terrain) for key, terrain in layer.terrain.items()}
         self.about = {key: layer.shots.about(*layer.place.corner(key)) for key in layer.terrain}
 
@@ -355,20 +364,24 @@ class _Ground:
         factor = bearable(shot.factor, int(size.min()))
         size //= np.int32(factor)
         placed, own = [], []
-        for store, windows in ((self.store, shot.windows), (self.second, shot.near_seams)):
-            for w in windows:
-                tile = store.get(w.key)
+        for w in (*shot.windows, *shot.near_seams):
+            position, rotation = self.about[w.key]
+            camera = position[shot.row], rotation[shot.row], layer.shots.lens[shot.row]
+            ground = self.lattices[w.key], layer.place.grid.gsd_m
+            if w.is_listed:
+                near = SeamPixels.open(layer.place.seam_file(w.key))
+                assert near is not None
+                some = near.of(shot.index + 1)
+                target = near.colors[:, some]
+                found = place_listed(near.index[some], layer.place.tile_px, *camera, *ground, size, factor)
+            else:
+                tile = self.store.get(w.key)
                 assert tile is not None
-                position, rotation = self.about[w.key]
-                window = np.array([w.row0, w.row1, w.col0, w.col1], np.int32)
-                found = place(
-                    tile.plane, shot.index + 1, window, position[shot.row], rotation[shot.row],
-                    layer.shots.lens[shot.row], self.lattices[w.key], layer.place.grid.gsd_m, size, factor,
-                )  # fmt: skip
-                if len(found[0]) and store is self.store:
-                    own.append((w.key, *found))
-                if len(found[0]):
-                    placed.append(_Placed(tile, *found, size=size, factor=factor, field=shot.field))
+                target, window = tile.packed, np.array([w.row0, w.row1, w.col0, w.col1], np.int32)
+                found = place(tile.plane, shot.index + 1, window, *camera, *ground, size, factor)
+            if len(found[0]):
+                own += [] if w.is_listed else [(w.key, *found)]
+                placed.append(_Placed(target, *found, size=size, factor=factor, field=shot.field))
         return placed, self._twice(own)
 
     def _twice(self, own: list[tuple[Key, Ints, Ints, Floats, Ints]]) -> int:
@@ -376,12 +389,12 @@ class _Ground:
         if not own:
             return 0
         boxes, side = np.array([box for *_, box in own]), self.layer.place.tile_px
-        low = (boxes[:, [2, 0]].min(0) // _SPOT_PX).astype(np.int32)
-        first = np.full((*(boxes[:, [3, 1]].max(0) // _SPOT_PX - low + 1), 2), -1, np.int32)
-        far_px = TWICE_M / self.layer.place.grid.gsd_m + 2 * _SPOT_PX
+        low = (boxes[:, [2, 0]].min(0) // SPOT_PX).astype(np.int32)
+        first = np.full((*(boxes[:, [3, 1]].max(0) // SPOT_PX - low + 1), 2), -1, np.int32)
+        far_px = TWICE_M / self.layer.place.grid.gsd_m + 2 * SPOT_PX
         corners = [np.array(key, np.int32) * np.int32(side) for key, *_ in own]
         return sum(
-            drawn_again(index, spots, side, corner, _SPOT_PX, far_px, low, first)
+            drawn_again(index, spots, side, corner, far_px, low, first)
             for corner, (_, index, spots, *_) in zip(corners, own, strict=True)
         )
 
@@ -394,7 +407,7 @@ class _Placed:
 
     def __init__(
         self,
-        tile: Tile,
+        target: NDArray[np.uint32],
         index: Ints,
         spots: Ints,
         sights: Floats,
@@ -404,7 +417,7 @@ class _Placed:
         factor: int,
         field: Floats,
     ) -> None:
-        self._tile, self._index, self._spots, self._sights = tile, index, spots, sights
+        self._target, self._index, self._spots, self._sights = target, index, spots, sights
         self._box, self._size, self._factor, self._field = box, size, factor, field
         left, right, top, bottom = box.tolist()
         width, height = size.tolist()
@@ -425,7 +438,7 @@ class _Placed:
         around = BEFORE + AFTER + 1
         lanes = scratch.words(bottom - top + around, right - left + around)
         widen(pixels, corner, self._box, self._size, lanes)
-        blend(self._tile.packed, self._index, self._spots, self._sights, lanes, self._box, self._field, WEIGHTS)
+        blend(self._target, self._index, self._spots, self._sights, lanes, self._box, self._field, WEIGHTS)
 
 
 class _Scratch:
@@ -478,7 +491,7 @@ def sample_pass(task: SampleTask) -> list[Sampled]:
 
 
 def _read(read: Read, path: Path, size: Ints) -> Bytes:
-    picture = read(path)
+    picture = read(path, int(size.max()))
     if picture.shape[:2] != (size[1], size[0]):
         raise PictureError.of(
             path,

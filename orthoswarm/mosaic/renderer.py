@@ -348,11 +348,11 @@ class _Job:
             return
         keys = list(self.place.store().existing())
         leveling = self.leveling(keys) if self.seams.level else None
-        width = self.seams.feather_px if self.seams.blend == "seam" else 0
-        tasks = (FinishTask(self.place, k, None if leveling is None else leveling.of_tile(k), width) for k in keys)
+        mixed = self.seams.blend == "seam"
+        tasks = (FinishTask(self.place, k, None if leveling is None else leveling.of_tile(k), mixed) for k in keys)
         for _ in self.run(finish_pass, tasks):
             pass
-        shutil.rmtree(self.place.other_pictures().folder, ignore_errors=True)
+        shutil.rmtree(self.place.seams, ignore_errors=True)
 
     def leveling(self, keys: Sequence[Key]) -> Leveling:
         """The steps at the seams of all tiles, solved together."""

@@ -21,11 +21,11 @@ WORK_WIDTH_PX: Final = 960  # longer side of the pictures on which corners are f
 class GreyPictures:
     """Grey pictures as they were decoded first; what cannot be written is decoded again.
 
-    Grey values of pictures of at most the refiner's working size come from the colours, which are read for drawing
-    anyhow; larger ones are decoded once more, reduced. Any number of processes may use a store at the same time.
+    They have the refiner's working size, and come from the colours of that size, which are read for drawing a preview
+    anyhow. Any number of processes may use a store at the same time.
 
-    folder: where the files are; an existing folder. from_colors: False to decode only the grey values of small
-    pictures, too, where colours are read elsewhere.
+    folder: where the files are; an existing folder. from_colors: False to decode only the grey values, where colours
+    are read elsewhere.
     """
 
     folder: Path
@@ -46,10 +46,11 @@ class GreyPictures:
             return None
         return cls(folder)
 
-    def rgb(self, path: Path) -> Bytes:
-        """See `read_rgb`; the grey values are stored."""
-        picture = read_rgb(path)
-        if _factor(picture.shape[1], picture.shape[0]) == 1 and path not in records(self.folder):
+    def rgb(self, path: Path, longest: int) -> Bytes:
+        """See `read_rgb`; not smaller than the working size, and the grey values of one of that size are stored."""
+        picture = read_rgb(path, longest)
+        height, width = picture.shape[:2]
+        if reduction(width, height, WORK_WIDTH_PX) == 1 and path not in records(self.folder):
             self._store(path, _luma(picture))
         return picture
 
@@ -61,9 +62,10 @@ class GreyPictures:
         """
         picture = self._stored(frame.path)
         if picture is None:
-            factor = _factor(frame.width, frame.height)
-            colors = self.from_colors and factor == 1
-            picture = _luma(read_rgb(frame.path)) if colors else read_gray(frame.path, factor)
+            if self.from_colors:
+                picture = _luma(read_rgb(frame.path, WORK_WIDTH_PX))
+            else:
+                picture = read_gray(frame.path, working_factor(frame))
             self._store(frame.path, picture)
         return picture
 
@@ -82,12 +84,13 @@ class GreyPictures:
 
 def stored_bytes(frames: Iterable[Frame]) -> int:
     """How much frames take in a store."""
-    return sum(frame.width * frame.height // _factor(frame.width, frame.height) ** 2 for frame in frames)
+    return sum(frame.width * frame.height // working_factor(frame) ** 2 for frame in frames)
+
+
+def working_factor(frame: Frame) -> int:
+    """By how much a picture is reduced for the refiner and the preview: 1, 2, 4 or 8."""
+    return reduction(frame.width, frame.height, WORK_WIDTH_PX)
 
 
 def _luma(picture: Bytes) -> Bytes:
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY))
-
-
-def _factor(width: int, height: int) -> int:
-    return reduction(width, height, WORK_WIDTH_PX)

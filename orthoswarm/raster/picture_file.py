@@ -72,25 +72,28 @@ def read_gray(path: Path, factor: int = 1) -> Bytes:
     data = _bytes(path)
     if _is_jpeg(data):
         return _decode_jpeg(path, data, "GRAY", fast_upsample=False, factor=factor)[..., 0]
-    picture = _decode_other(path, data, gray=True)
-    if factor == 1:
-        return picture
-    import cv2
-
-    size = (picture.shape[1] // factor, picture.shape[0] // factor)
-    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
+    return _mean(_decode_other(path, data, gray=True), factor)
 
 
-def read_rgb(path: Path) -> Bytes:
+def read_rgb(path: Path, longest: int | None = None) -> Bytes:
     """A picture's colours, uint8 (rows, columns, 3), red first; grey pictures are repeated in all three.
+
+    Args:
+        path: the file.
+        longest: reduce it by the factor of `reduction` to this longer side; None not to.
 
     Raises:
         PictureError: if the file is not a picture or is damaged beyond decoding.
     """
     data = _bytes(path)
     if _is_jpeg(data):
-        return _decode_jpeg(path, data, "RGB", fast_upsample=True)
-    return np.ascontiguousarray(_decode_other(path, data, gray=False)[..., ::-1])
+        width, height = _jpeg_size(data)
+        factor = 1 if longest is None else reduction(width, height, longest)
+        return _decode_jpeg(path, data, "RGB", fast_upsample=True, factor=factor)
+    picture = _decode_other(path, data, gray=False)
+    height, width = picture.shape[:2]
+    reduced = picture if longest is None else _mean(picture, reduction(width, height, longest))
+    return np.ascontiguousarray(reduced[..., ::-1])
 
 
 def read_rgba(path: Path) -> Bytes:
@@ -206,6 +209,16 @@ def _decode_other(path: Path, data: bytes, *, gray: bool) -> Bytes:
     if image is None:
         raise PictureError.of(path, "is not a readable picture; leave it out or copy it again")
     return np.asarray(image)
+
+
+def _mean(picture: Bytes, factor: int) -> Bytes:
+    """The means of blocks of a picture, whose sides the factor divides."""
+    if factor == 1:
+        return picture
+    import cv2
+
+    size = (picture.shape[1] // factor, picture.shape[0] // factor)
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
 
 
 def _holds_measurements(data: bytes) -> bool:

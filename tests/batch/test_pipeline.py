@@ -212,6 +212,20 @@ def test_an_interrupted_run_is_continued(flight, mapped, tmp_path, when):
         assert any("continued" in w for w in report["warnings"])
 
 
+def test_a_quick_look_is_coarser_and_the_same_run_goes_on_from_it(flight, mapped, tmp_path):
+    photos, basemap, out, seen = flight[2] / "photos", flight[2] / "map.tif", tmp_path / "out", []
+    quick = make(photos, out, MapOptions(basemap=basemap, quick=True))
+    assert any("--quick" in w for w in quick["warnings"])
+    assert quick["gsd_m"] == pytest.approx(4.0 * mapped[1]["gsd_m"])
+    with rasterio.open(out / "orthoimage.tif") as image:
+        assert image.res[0] == pytest.approx(quick["gsd_m"])
+    report = make(photos, out, MapOptions(basemap=basemap), progress=lambda what, *_: seen.append(what))
+    assert not {"drawing realtime", "solo"} & set(seen)
+    assert not any("--quick" in w or "continued" in w for w in report["warnings"])
+    assert content(out) == content(mapped[0])
+    assert {p.name for p in out.iterdir()} == set(PRODUCTS)
+
+
 def test_a_refusal_leaves_an_interrupted_run_to_be_continued(flight, mapped, tmp_path):
     def interrupt(what, done, total):
         if what == "drawing orthoimage":

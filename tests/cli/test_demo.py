@@ -12,7 +12,7 @@ import pytest
 
 from gcs_plugin.cli.main import main
 from gcs_plugin.demo.demonstration import PacedClock, vehicle_rate, wait_for
-from gcs_plugin.demo.setting import DemoSetting, Errors
+from gcs_plugin.demo.simulated_camera import DemoSetting, Errors
 from orthoswarm.model.errors import OrthoSwarmError
 
 

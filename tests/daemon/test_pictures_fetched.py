@@ -1,16 +1,17 @@
 """Pictures stay on a vehicle's card: they are asked from it in flight, arrive, and the ground counts as seen."""
 
 import math
+import time
 from pathlib import Path
 
 import pytest
 
 from gcs_plugin.links.mavlink import Autopilot
-from gcs_plugin.sim.file_server import FileServer
 from gcs_plugin.sim.multirotor import Airframe
-from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
+from gcs_plugin.sim.simulated_swarm import SimSwarm
 from tests.kit.daemon_kit import GRID, camera_at, jpeg, serving
 from tests.kit.mosaic_scene import EAST, NORTH
+from tests.kit.vehicles.file_server import CardVehicle, FileServer
 from tests.kit.vehicles.sim_cameras import Cameras, square
 
 _ON_THE_CARD = range(5, 13)
@@ -37,12 +38,12 @@ class CardCameras(Cameras):
 def test_pictures_on_the_card_are_fetched_over_the_link(tmp_path: Path, autopilot: Autopilot) -> None:
     lat, lon = (float(v) for v in GRID.to_geographic([EAST - 80.0, NORTH - 80.0]))
     cameras, server = CardCameras(), FileServer()
-    vehicles = make_swarm(
-        1, autopilots=(autopilot,), home=(lat, lon, 500.0), airframe=Airframe(climb_m_s=8.0),
-        on_exposure=cameras.expose, files=server,
+    vehicle = CardVehicle(
+        server, system=1, autopilot=autopilot, home=(lat, lon, 500.0), airframe=Airframe(climb_m_s=8.0),
+        on_exposure=cameras.expose, boot_utc_s=time.time(),
     )  # fmt: skip
     with (
-        SimSwarm(vehicles, "tcpin:127.0.0.1:0", speed=4.0) as swarm,
+        SimSwarm([vehicle], "tcpin:127.0.0.1:0", speed=4.0) as swarm,
         serving(tmp_path / "w", "--link", swarm.addresses[0]) as served,
     ):
         cameras.served = served

@@ -100,7 +100,7 @@ class Flight:
         self.pictures[name] = picture_of(camera, height, gain)
         return self
 
-    def read(self, path: Path) -> np.ndarray:
+    def read(self, path: Path, longest: int = 0) -> np.ndarray:
         return self.pictures[path.name]
 
     @property

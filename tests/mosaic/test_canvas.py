@@ -1,7 +1,6 @@
 """The canvas: sparse, bounded in memory, versioned, readable at any scale, and whole after a kill."""
 
 import errno
-import os
 import signal
 import subprocess
 import sys
@@ -224,7 +223,7 @@ def test_full_disk_is_an_error_and_leaves_nothing_half_made(canvas, monkeypatch)
         raise OSError(errno.ENOSPC, "No space left on device")
 
     paint(canvas, (0, 0))
-    monkeypatch.setattr(os, "posix_fallocate", full)
+    monkeypatch.setattr("orthoswarm.canvas.tile_store._write_zeros", full)
     with pytest.raises(OrthoSwarmError, match="free some disk space"):
         canvas.begin((0, 1))
     monkeypatch.undo()

@@ -154,7 +154,7 @@ def test_unreadable_picture_is_replaced_by_its_neighbours_and_reported(canvas):
     flight = scene.survey(2)
     bad = flight.frames[4].frame.image
 
-    def read(path):
+    def read(path, longest):
         if path.name == bad:
             raise PictureError(f"{bad} is a damaged JPEG")
         return flight.read(path)
@@ -185,7 +185,7 @@ def test_absurd_frames_are_left_out_with_a_reason(canvas):
     flight.take(scene.camera(height=-3.0))
     flight.take(scene.camera(height=5000.0))
     flight.take(scene.camera(height=float("nan")))
-    stats = render(flight.frames, FLAT, canvas, read=lambda path: good[path.name])
+    stats = render(flight.frames, FLAT, canvas, read=lambda path, longest: good[path.name])
     reasons = [stats.rejected[f.frame.image] for f in flight.frames[2:]]
     for reason, word in zip(reasons, ["horizon", "not above the ground", "5000 m", "not a number"]):
         assert word in reason
@@ -364,7 +364,7 @@ def test_pictures_are_drawn_again_from_their_kept_parts_without_being_read(tmp_p
     parts = PictureParts.create(tmp_path / "parts", len(flight.frames), 2000.0)
     images, read = [], []
 
-    def counted(path):
+    def counted(path, longest):
         read.append(path)
         return flight.read(path)
 

@@ -12,7 +12,7 @@ import pytest
 import shapely
 from fastapi import Request
 
-from gcs_plugin.web.areas import area_of, read_area
+from gcs_plugin.web.uploads import area_of, read_area
 from orthoswarm.model.errors import InputError
 from orthoswarm.planning.area.area import make_area
 from orthoswarm.planning.area.shape_files import MOST_CORNERS, Polygon, parse_geojson
@@ -178,7 +178,7 @@ def test_a_large_file_is_read_in_another_process_so_that_the_server_answers_othe
 
     large = circle(20_000)
     wanted = area_of(large, "a.geojson")
-    monkeypatch.setattr("gcs_plugin.web.areas.read_shapes", refuse)
+    monkeypatch.setattr("gcs_plugin.web.uploads.read_shapes", refuse)
     assert posted(large) == wanted
     with pytest.raises(InputError, match="this process"):
         posted(circle(20))

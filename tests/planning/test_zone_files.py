@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 import shapely
 
-from gcs_plugin.plans import area_files
-from gcs_plugin.plans.area_files import read_shapes
-from gcs_plugin.plans.no_fly import Reach, read_no_fly, read_zones
+from gcs_plugin.plans.area_files import Reach, read_no_fly, read_shapes, read_zones
 from gcs_plugin.plans.plan_files import geojson, read_planned_flight, write_plan
 from gcs_plugin.plans.plan_request import PlanRequest, make_plan
 from orthoswarm.model.errors import InputError
+from orthoswarm.planning.area import shape_files
 from orthoswarm.planning.area.area import make_area
 from tests.vehicles.autopilots.test_twin_camera import small_area
 
@@ -231,8 +230,8 @@ def test_of_a_national_file_the_zones_near_the_flights_are_used_and_the_others_c
     document = national(3000, ZONES["ED-269"]["features"])
     (tmp_path / "zones.json").write_text(json.dumps(document))
     parsed = []
-    read = area_files.parse_geojson
-    monkeypatch.setattr(area_files, "parse_geojson", lambda *a, **k: parsed.append(a[1]) or read(*a, **k))
+    read = shape_files.parse_geojson
+    monkeypatch.setattr(shape_files, "parse_geojson", lambda *a, **k: parsed.append(a[1]) or read(*a, **k))
     request = PlanRequest(
         area=tmp_path / "area.json", vehicles=1, altitude_m=60.0, fov_min_deg=60.0, no_fly=[tmp_path / "zones.json"]
     )

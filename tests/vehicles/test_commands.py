@@ -15,8 +15,8 @@ from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.links.transports import TcpLink
 from gcs_plugin.mission.exchange import GROUND_STATION, Verdict
 from gcs_plugin.mission.items import TAKEOFF, MissionItem
-from gcs_plugin.sim.lossy_radio import Faults
 from gcs_plugin.sim.mission_flight import MissionFlight
+from gcs_plugin.sim.simulated_swarm import Faults
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.errors import OrthoSwarmError
 from tests.kit.vehicles.memory_link import SimLink, VirtualClock

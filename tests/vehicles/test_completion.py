@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gcs_plugin.links.mavlink import Autopilot, dialect
-from gcs_plugin.links.tlog_writer import read_tlog
 from gcs_plugin.mission.completion import CompletionDetector, MissionEvent, Phase
 from gcs_plugin.mission.items import LAND, LOITER_UNLIM, RTL, TAKEOFF, TRIGGER_DISTANCE, WAYPOINT, Mission, MissionItem
+from tests.kit.vehicles.telemetry_log import read_tlog
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
 NOT_STARTED, ACTIVE, PAUSED, COMPLETE = 2, 3, 4, 5

@@ -13,15 +13,14 @@ from gcs_plugin.fleet.flight_state import summary
 from gcs_plugin.fleet.routes import BootClock, Routes
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.links.packets import Framer, checksum
-from gcs_plugin.links.tlog_writer import read_tlog
 from gcs_plugin.links.transports import UdpLink
 from gcs_plugin.mission.completion import CompletionDetector
 from gcs_plugin.mission.exchange import Address
 from gcs_plugin.mission.items import RTL, MissionItem
-from gcs_plugin.sim.lossy_radio import Faults
-from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
+from gcs_plugin.sim.simulated_swarm import Faults, SimSwarm, make_swarm
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.errors import InputError, OrthoSwarmError
+from tests.kit.vehicles.telemetry_log import read_tlog
 from tests.vehicles.test_sim import mission
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4

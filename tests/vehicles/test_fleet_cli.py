@@ -23,6 +23,7 @@ from tests.vehicles.test_mission_builder import make_plan
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
 HOME = (47.3977, 8.5456, 488.0)
+pytestmark = pytest.mark.usefixtures("in_vehicle_time")
 LONG_S = 240  # real seconds for a flight that takes five
 
 
@@ -85,11 +86,11 @@ def test_events_are_told_while_others_wait_and_a_return_from_elsewhere_is_heard(
     """Two terminals: one starts a plan, the other sends all home while the second vehicle waits for its takeoff."""
     document = json.loads((folder / "plan.json").read_text())
     for number, vehicle in enumerate(document["vehicles"]):
-        vehicle["flights"][0]["start_s"] = 6.0 * number
+        vehicle["flights"][0]["start_s"] = 3.0 * number
     (folder / "plan.json").write_text(json.dumps({"vehicles": document["vehicles"][:2]}))
     port = free_port()
     vehicles = make_swarm(2, home=HOME)
-    with SimSwarm(vehicles, f"udpout:127.0.0.1:{port}", speed=4.0):
+    with SimSwarm(vehicles, f"udpout:127.0.0.1:{port}", speed=8.0):
         link = f"udpin:127.0.0.1:{port}"
         assert fleet(capsys, "upload", folder, "--vehicle", "1,2", "--link", link)[0] == 0
 
@@ -201,7 +202,7 @@ def test_whoever_waits_is_left_holding_by_ctrl_c_and_that_is_said(flying, capsys
 @pytest.mark.parametrize("flying", [1.0], indirect=True)
 def test_turns_that_take_too_long_end_with_exit_code_one(flying, capsys):
     _, link = flying
-    words = ("rtl", "--in-turn", "--seconds", 1, "--vehicle", "1,3,9", "--wait", 1, "--link", link)
+    words = ("rtl", "--in-turn", "--seconds", 0.2, "--vehicle", "1,3,9", "--wait", 1, "--link", link)
     code, said = fleet(capsys, *words, "--json")
     assert code == 1
     assert sorted(row["outcome"] for row in said["vehicles"]) == ["done", "not_sent", "not_sent"]  # 2 is told nothing

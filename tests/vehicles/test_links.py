@@ -11,13 +11,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gcs_plugin.links import outgoing
+from gcs_plugin.links import outgoing, transports
 from gcs_plugin.links.mavlink import dialect
 from gcs_plugin.links.packets import Framer, checksum
 from gcs_plugin.links.signing import Signing, find_key, key_from, signing_time
-from gcs_plugin.links.tlog_writer import TlogWriter, read_tlog
+from gcs_plugin.links.tlog_writer import TlogWriter
 from gcs_plugin.links.transports import LinkAddress, SerialLink, TcpLink, UdpLink, parse_address, parse_link
 from orthoswarm.model.errors import InputError
+from tests.kit.vehicles.telemetry_log import read_tlog
 
 KEY = bytes(range(32))
 NOW = 1_760_000_000.0
@@ -303,8 +304,9 @@ def test_a_serial_line_that_takes_nothing_holds_up_nobody_and_its_commands_are_n
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="pseudo terminals are POSIX")
-def test_a_serial_line_opened_behind_a_thousand_files_is_opened_again_when_there_are_fewer(loop):
+def test_a_serial_line_opened_behind_a_thousand_files_is_opened_again_when_there_are_fewer(loop, monkeypatch):
     """select() knows descriptors up to 1,023."""
+    monkeypatch.setattr(transports, "_RETRY_S", 0.1)
     pytest.importorskip("serial")
     resource = pytest.importorskip("resource")
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)

@@ -15,9 +15,8 @@ from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.items import CHANGE_SPEED, LAND, RTL, TAKEOFF, WAYPOINT, Mission, MissionItem
 from gcs_plugin.mission.plan_folder import PlanNeeds
 from gcs_plugin.mission.track import Airspace, flight_seconds, highest_m
-from gcs_plugin.sim.lossy_radio import Faults
 from gcs_plugin.sim.multirotor import Chart
-from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
+from gcs_plugin.sim.simulated_swarm import Faults, SimSwarm, make_swarm
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.config import config_of
 from orthoswarm.model.earth import distance_m
@@ -28,6 +27,7 @@ from tests.vehicles.test_mission_builder import make_plan
 from tests.vehicles.test_sim import mission
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
+pytestmark = pytest.mark.usefixtures("in_vehicle_time")
 BOTH = pytest.mark.parametrize("autopilot", [AP, PX4])
 CHART = Chart(47.397742, 8.545594, 488.0)
 

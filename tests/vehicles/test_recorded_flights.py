@@ -14,7 +14,6 @@ from gcs_plugin.fleet.fleet import Fleet
 from gcs_plugin.fleet.flight_state import flight_state
 from gcs_plugin.fleet.preflight import Level, Wanted, preflight
 from gcs_plugin.links.mavlink import Autopilot
-from gcs_plugin.links.tlog_writer import read_tlog
 from gcs_plugin.links.transports import Link
 from gcs_plugin.mission.completion import MissionEvent
 from gcs_plugin.mission.items import CHANGE_SPEED, RTL, TAKEOFF, WAYPOINT, Mission, MissionItem
@@ -24,6 +23,7 @@ from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.config import DEFAULT
 from orthoswarm.model.earth import distance_m
 from tests.kit.vehicles.memory_link import VirtualClock, World
+from tests.kit.vehicles.telemetry_log import read_tlog
 
 FLIGHTS = Path(__file__).parents[1] / "data" / "flights"
 

@@ -21,8 +21,8 @@ from gcs_plugin.mission.items import (
     MissionItem,
 )
 from gcs_plugin.mission.track import flight_seconds, track_of
-from gcs_plugin.sim.lossy_radio import Channel, Faults
 from gcs_plugin.sim.multirotor import Airframe, Chart
+from gcs_plugin.sim.simulated_swarm import Channel, Faults
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.config import DEFAULT
 from tests.kit.vehicles.memory_link import World

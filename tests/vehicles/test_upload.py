@@ -24,8 +24,8 @@ from gcs_plugin.mission.items import (
     difference,
 )
 from gcs_plugin.mission.upload import MissionUpload
-from gcs_plugin.sim.lossy_radio import Channel, Faults
 from gcs_plugin.sim.mission_store import MissionStore
+from gcs_plugin.sim.simulated_swarm import Channel, Faults
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
 BOTH = pytest.mark.parametrize("autopilot", [AP, PX4])

@@ -18,13 +18,14 @@ from gcs_plugin.fleet.separation.separation_watch import Near, SeparationWatch
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.mission_builder import read_mission
 from gcs_plugin.mission.plan_folder import plan_needs
-from gcs_plugin.sim.lossy_radio import NO_FAULTS, Faults
-from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
+from gcs_plugin.sim.multirotor import Airframe
+from gcs_plugin.sim.simulated_swarm import NO_FAULTS, Faults, SimSwarm, make_swarm
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from telemetry.live.live_poses import LinkPoses
 from tests.vehicles.test_fleet_cli import HOME, folder  # noqa: F401
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
+CLIMBS_FAST = Airframe(climb_m_s=8.0)
 
 
 class PlanFolder:
@@ -45,7 +46,7 @@ class PlanFolder:
 
 
 @pytest.fixture
-def open_links(tmp_path):
+def open_links(tmp_path, in_vehicle_time):
     opened = []
 
     def make(vehicles, *, key=None, speed=10.0, named=(), delay_s=0.0):
@@ -93,8 +94,7 @@ def upload_all(links, folder):  # noqa: F811
 
 
 def test_all_are_commanded_at_once_with_an_outcome_each(open_links, folder):  # noqa: F811
-    vehicles = make_swarm(3, autopilots=(AP, PX4), home=HOME)
-    links = open_links(vehicles)
+    links = open_links(make_swarm(3, autopilots=(AP, PX4), home=HOME, airframe=CLIMBS_FAST))
     ready(links, 3)
     rows = links.commands("pause")
     assert [(r["vehicle"], r["command"], r["outcome"]) for r in rows] == [
@@ -226,7 +226,7 @@ def test_a_row_has_the_autopilots_words_and_home(open_links):
 
 
 def test_a_vehicle_that_acknowledged_a_pause_takes_another_mission_at_once(open_links, folder):  # noqa: F811
-    links = open_links(make_swarm(1, autopilots=(AP,), home=HOME), speed=5.0)  # its mission takes half a minute then
+    links = open_links(make_swarm(1, home=HOME, airframe=CLIMBS_FAST), speed=5.0)  # its mission takes long enough then
     ready(links, 1)
     upload_all(links, folder)
     assert [row["outcome"] for row in links.commands("start")] == ["done"]

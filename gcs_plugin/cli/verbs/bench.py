@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
 def _accuracy(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from gcs_plugin.bench.accuracy import METHODS, accuracy_table, run_accuracy
 
-    methods = _list(args.methods)
+    methods = [part.strip() for part in args.methods.split(",") if part.strip()]
     if not methods or set(methods) - set(METHODS):
         raise InputError(f"--methods takes some of {', '.join(METHODS)}; give them with commas between")
     result = run_accuracy(args.sets, methods, args.out, args.workers, args.keep)
@@ -90,7 +90,3 @@ def _scaling(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     )
     plot_scaling(result, args.figures or args.out)
     return result, scaling_table(result)
-
-
-def _list(text: str) -> list[str]:
-    return [part.strip() for part in text.split(",") if part.strip()]

@@ -33,10 +33,10 @@ def run(args: argparse.Namespace) -> int:
 
     prepare_process()
 
-    from gcs_plugin.cli.progress import ProgressBars
+    from gcs_plugin.cli.arguments import ProgressBars
     from gcs_plugin.cli.verbs.doctor import compile_cold_kernels
     from gcs_plugin.demo.demonstration import run_demo
-    from gcs_plugin.demo.setting import DemoSetting
+    from gcs_plugin.demo.simulated_camera import DemoSetting
 
     if not 1 <= args.vehicles <= 12:
         raise InputError(f"{args.vehicles} vehicles are not possible here; choose 1 to 12")
@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
 
     def opened(url: str) -> None:
         print(f"map: {url}", file=sys.stderr, flush=True)
-        if not args.no_browser and _has_display():
+        if not args.no_browser and sys.stdout.isatty() and any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))):
             import webbrowser
 
             webbrowser.open(url)
@@ -63,11 +63,6 @@ def run(args: argparse.Namespace) -> int:
     if args.median is not None and (median is None or median > args.median):
         raise OrthoSwarmError(f"the map's median error is {median} m, more than the {args.median:g} m that were asked")
     return 0
-
-
-def _has_display() -> bool:
-
-    return sys.stdout.isatty() and bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def _tell(report: dict[str, object], out: Path) -> None:

@@ -105,7 +105,7 @@ def _live(args: argparse.Namespace) -> int:
     """Print where pictures were drawn first."""
     if args.truth is None or args.ortho is not None:
         raise InputError("--live WORKSPACE needs --truth FRAMES.csv, and no orthoimage")
-    from gcs_plugin.bench.live_errors import live_errors
+    from gcs_plugin.bench.accuracy import live_errors
 
     found = live_errors(args.live, args.truth)
     if args.json:
@@ -131,11 +131,7 @@ def _of_the_drawing(ortho: Path) -> dict[str, Any]:
 
 
 def _wait(args: argparse.Namespace) -> None:
-    """Wait until the orthoimage is there and, in a daemon's workspace, was written after the last refinement.
-
-    Raises:
-        OrthoSwarmError: that takes longer. InputError: there is nothing to wait for, or to measure it against.
-    """
+    """Wait until the orthoimage is there and, in a daemon's workspace, was written after the last refinement."""
     from gcs_plugin.daemon.store.journal import wrote_refined
     from orthoswarm.export.catalog.tiled_raster import product_file
 

@@ -33,8 +33,7 @@ def run(args: argparse.Namespace) -> int:
 
     prepare_process()
 
-    from gcs_plugin.cli.arguments import require_no_file
-    from gcs_plugin.cli.progress import ProgressBars
+    from gcs_plugin.cli.arguments import ProgressBars, require_no_file
 
     if not 1 <= args.quality <= 100:
         raise InputError(f"--quality {args.quality} is out of range; give 1 to 100")
@@ -71,11 +70,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _require_report(path: Path) -> None:
-    """Refuse a damaged report before the work; formats that need none accept that there is none.
-
-    Raises:
-        InputError: it is there and cannot be read.
-    """
+    """Refuse a damaged report before the work; formats that need none accept that there is none."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

@@ -17,8 +17,8 @@ from orthoswarm.model.errors import InputError
 if TYPE_CHECKING:
     from gcs_plugin.backends import Backend
     from gcs_plugin.fleet.commands import Order
-    from gcs_plugin.fleet.fleet_events import FleetEvent
     from gcs_plugin.fleet.preflight import Check
+    from gcs_plugin.fleet.reception import FleetEvent
     from gcs_plugin.mission.exchange import Outcome
     from gcs_plugin.mission.items import Mission
 
@@ -236,11 +236,7 @@ class _Prepared:
 
 
 def parse_systems(texts: Sequence[str]) -> list[int]:
-    """System ids in `3`, `v3` or `1,2,5`.
-
-    Raises:
-        InputError: not a system id.
-    """
+    """System ids in `3`, `v3` or `1,2,5`; raises InputError: not a system id."""
     systems: list[int] = []
     for text in texts:
         for part in text.split(","):
@@ -562,7 +558,7 @@ def _refusal(outcome: "Outcome") -> dict[str, Any]:
 
 
 def _with_bar(work: Any) -> Any:
-    from gcs_plugin.cli.progress import ProgressBars
+    from gcs_plugin.cli.arguments import ProgressBars
 
     with ProgressBars() as bars:
         return work(bars)

@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     import tempfile
     from contextlib import suppress
 
-    from gcs_plugin.cli.progress import ProgressBars
+    from gcs_plugin.cli.arguments import ProgressBars
     from orthoswarm.compute.workers import prepare_process
     from orthoswarm.model.errors import InputError, OrthoSwarmError
 

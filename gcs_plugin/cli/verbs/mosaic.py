@@ -32,8 +32,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("inputs", nargs="+", type=path_of, metavar="INPUT", help="folders of photos, photos, videos")
     add("--basemap", type=path_of, metavar="MAP", help="pre-disaster map: GeoTIFF, COG, MBTiles or folder z/x/y.png")
     add("--out", type=path_of, required=True, metavar="DIR", help="output folder; an interrupted run goes on there")
-    refiners = _refiners()
+    refiners = ["swarm", "paper"] if find_spec("orthoswarm.paper") else ["swarm"]
     add("--refine", choices=refiners, default=refiners[0], help=f"how pictures are refined (default {refiners[0]})")
+    add(
+        "--quick", action="store_true",
+        help="draw the refined map at a quarter of the detail; the same command without it goes on from there",
+    )  # fmt: skip
     add("--until", choices=("realtime", "coarse", "fine"), default="fine", help="last stage to run (default fine)")
     add(
         "--fov-min",
@@ -84,12 +88,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--tone", choices=("photos", "map"), default="photos",
         help="brightness and hue of large areas: as the photos have it (default), or as the basemap has",
     )  # fmt: skip
-    add(
-        "--blend",
-        choices=("none", "seam"),
-        default="seam",
-        help="blend pictures over a few pixels at seams, or not",
-    )
+    add("--blend", choices=("none", "seam"), default="seam", help="blend pictures over a few pixels at seams, or not")
     add("--covariance", action="store_true", help="add covariances of position and rotation to frames.jsonl")
     add(
         "--tiles", choices=("auto", "yes", "no"), default="auto",
@@ -106,11 +105,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--json", action="store_true", help="print the report as one JSON document on stdout")
 
 
-def _refiners() -> list[str]:
-    """The refiners that are installed."""
-    return ["swarm", "paper"] if find_spec("orthoswarm.paper") else ["swarm"]
-
-
 def run(args: argparse.Namespace) -> int:
     """Make the map."""
     from orthoswarm.compute.workers import Processes, prepare_process
@@ -122,7 +116,7 @@ def run(args: argparse.Namespace) -> int:
     from functools import partial
 
     import telemetry
-    from gcs_plugin.cli.progress import ProgressBars
+    from gcs_plugin.cli.arguments import ProgressBars
     from orthoswarm.batch.pipeline import run as run_pipeline
     from orthoswarm.batch.run_state import is_written
     from orthoswarm.batch.workspace import VIDEO, missing, unmake
@@ -251,6 +245,8 @@ def _check(args: argparse.Namespace) -> None:
             raise InputError("--tone map takes brightness and hue from a basemap; give one with --basemap")
         if not args.gains or args.until != "fine":
             raise InputError("--tone map needs balanced, refined pictures; leave out --no-gains and --until")
+    if args.quick and (args.until == "realtime" or args.surface is not None):
+        raise InputError("--quick draws the refined map; leave out --until realtime and --surface")
     if args.control is not None and args.until == "realtime":
         raise InputError("--control moves refined pictures; leave out --until realtime")
     if not args.pixel_scale > 0.0:

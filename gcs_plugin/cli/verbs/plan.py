@@ -27,12 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("area", type=Path, nargs="?", metavar="AREA", help="polygon to cover, or line to follow")
     add("--gaps", type=Path, metavar="GAPS", help="instead of AREA: gaps.geojson of `orthoswarm coverage`, flown again")
-    add(
-        "--map",
-        type=Path,
-        metavar="OUT",
-        help="take the field of view from this map's pictures, two sigma narrower",
-    )
+    add("--map", type=Path, metavar="OUT", help="take the field of view from this map's pictures, two sigma narrower")
     add("--fly-not-arrived", action="store_true", help="fly gaps, too, whose pictures were taken but have not arrived")
     add("--vehicles", type=int, required=True, metavar="N", help="how many vehicles")
     altitude_help = "height of the lines above takeoff, with --dem above the ground (default: that of a survey in AREA)"

@@ -44,9 +44,8 @@ def run(args: argparse.Namespace) -> int:
     """Fly until interrupted, or for --seconds."""
     from gcs_plugin.links.mavlink import Autopilot
     from gcs_plugin.links.signing import find_key
-    from gcs_plugin.sim.lossy_radio import Faults
     from gcs_plugin.sim.multirotor import Airframe
-    from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
+    from gcs_plugin.sim.simulated_swarm import Faults, SimSwarm, make_swarm
 
     if not (0.0 <= args.loss <= 1.0 and 0.0 <= args.duplicate <= 1.0 and args.delay >= 0.0):
         raise InputError("loss and duplicate are shares from 0 to 1, delay is seconds; correct them")

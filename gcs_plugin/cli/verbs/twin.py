@@ -110,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
     """Make the set, or follow a vehicle."""
     if args.action == "camera":
         return _follow_vehicles(args)
-    from gcs_plugin.cli.progress import ProgressBars
+    from gcs_plugin.cli.arguments import ProgressBars
     from orthoswarm.twin.make import make_twin
 
     _check(args)
@@ -132,11 +132,7 @@ _POSITIVE = ("map_gsd", "spacing_m", "leg_spacing_m", "height_m", "speed_m_s")
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Refuse values of which no set can be made.
-
-    Raises:
-        InputError: one is out of range, or --out is a file.
-    """
+    """Refuse values of which no set can be made; raises InputError: one is out of range, or --out is a file."""
     from gcs_plugin.cli.arguments import require_no_file
 
     for name, least in _LEAST.items():
@@ -295,7 +291,7 @@ def _say(text: str) -> None:
 
 def _world(args: argparse.Namespace, place: tuple[float, float]) -> tuple[Path, Any]:
     """The set's folder and its specification; made if absent."""
-    from gcs_plugin.cli.progress import ProgressBars
+    from gcs_plugin.cli.arguments import ProgressBars
     from gcs_plugin.demo.following_camera import away_m, place_spec, read_spec, set_there, write_set
 
     folder = args.set or Path(f"twin-{args.preset}")

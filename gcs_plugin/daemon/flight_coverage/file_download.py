@@ -256,14 +256,7 @@ def numbered(payload: FtpPayload, number: int) -> FtpPayload:
 
 
 class LinkShare:
-    """A rate that follows the delay.
-
-    Args:
-        most_bytes_s: upper bound, bytes a second.
-
-    Attributes:
-        rate: bytes a second.
-    """
+    """A rate that follows the delay; `most_bytes_s`: upper bound, bytes a second; `rate`: bytes a second."""
 
     def __init__(self, most_bytes_s: float) -> None:
         self.most, self.rate = most_bytes_s, min(most_bytes_s, 3.0 * _LEAST_BYTES_S)

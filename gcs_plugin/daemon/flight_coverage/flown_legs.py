@@ -11,8 +11,7 @@ import shapely
 from numpy.typing import NDArray
 
 from gcs_plugin.daemon.vehicle_names import VehicleRow
-from gcs_plugin.plans.area_files import read_shapes
-from gcs_plugin.plans.no_fly import Reach
+from gcs_plugin.plans.area_files import Reach, read_shapes
 from gcs_plugin.plans.plan_files import read_planned_flight
 from orthoswarm.coverage.gaps import PlannedFlight
 from orthoswarm.model.errors import InputError

@@ -10,10 +10,10 @@ import sqlite3
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Protocol, TypedDict
+from typing import Any, Final, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,7 @@ from gcs_plugin.daemon.flight_coverage.picture_views import FlawedPictures, Meas
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.stoppable_thread import Background
 from gcs_plugin.daemon.store.console_state import ConsoleState
-from gcs_plugin.daemon.store.daemon_events import CoverageChanged, Events, PictureDrawn
+from gcs_plugin.daemon.store.daemon_events import Events, PictureDrawn
 from gcs_plugin.daemon.store.frame_rows import last_drawn_arrival
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.vehicle_names import VehicleRow
@@ -118,8 +118,13 @@ class CoverageDocument(TypedDict, total=False):
 
 
 @dataclass(frozen=True, slots=True)
-class _Result:
-    """The latest result: the API's document, gaps as GeoJSON, the picture of the cells, and the placed pictures."""
+class CoverageResult:
+    """The latest result.
+
+    Attributes:
+        document: shares, and gaps with their causes, as JSON values. gaps: as `orthoswarm coverage` writes them.
+        png: the states of the cells, empty while there is no area. placed: the pictures that are placed.
+    """
 
     document: CoverageDocument
     gaps: dict[str, Any]
@@ -127,7 +132,7 @@ class _Result:
     placed: list[View]
 
 
-_NOTHING: Final = _Result(
+_NOTHING: Final = CoverageResult(
     {
         "state": "no area", "version": 0, "plan": None, "seen_share": None, "poor_share": None, "missed_share": None,
         "planned_share": None, "gaps": [], "missing_pictures": [], "offers": [], "warnings": [],
@@ -136,39 +141,30 @@ _NOTHING: Final = _Result(
 )  # fmt: skip
 
 
-class LinkedVehicles(Protocol):
-    """The vehicles on the links.
-
-    Attributes:
-        latest: their rows, at most half a second old.
-    """
-
-    latest: Rows
-
-
 class LiveCoverage(Background):
     """Updates the coverage.
 
     Args:
         views: of the workspace's pictures. console, plans: the operator's plan, and the folder of all plans: these say
-            what the area is. drawer: knows the map's grid. vehicles: on the links. exposures: reported by them.
+            what the area is. drawer: knows the map's grid. on_links: rows of the vehicles there, at most half a second
+            old. exposures: reported by them.
 
     Attributes:
-        seconds: duration of the last search for gaps. battery: remaining flight time of the vehicles.
+        result: of the last search for gaps. seconds: its duration. battery: remaining flight time of the vehicles.
     """
 
     def __init__(
         self, journal: Journal, events: Events, *, views: PictureViews, console: ConsoleState, plans: Path,
-        drawer: Drawer, vehicles: LinkedVehicles, exposures: ExposureJournal,
+        drawer: Drawer, on_links: Callable[[], Rows], exposures: ExposureJournal,
     ) -> None:  # fmt: skip
         super().__init__("coverage", join_s=None)
         self._journal, self._events, self._views = journal, events, views
-        self._console, self._plans, self._drawer, self._vehicles = console, plans, drawer, vehicles
+        self._console, self._plans, self._drawer, self._on_links = console, plans, drawer, on_links
         self._exposures = exposures
         self._fresh: deque[tuple[View, PictureQuality | None]] = deque()
         self._bell = threading.Event()
         self._followed: _Followed | None = None
-        self._result = _NOTHING
+        self.result = _NOTHING
         self._version = 0
         self._rest_until = 0.0
         self._refused: AreaSource | None = None
@@ -192,21 +188,6 @@ class LiveCoverage(Background):
         self._bell.set()
 
     @property
-    def document(self) -> CoverageDocument:
-        """Shares, and gaps with their causes, as JSON values."""
-        return self._result.document
-
-    @property
-    def gaps(self) -> dict[str, Any]:
-        """The gaps as GeoJSON, as `orthoswarm coverage` writes them."""
-        return self._result.gaps
-
-    @property
-    def png(self) -> bytes:
-        """The states of the cells as a PNG; empty while there is no area."""
-        return self._result.png
-
-    @property
     def no_fly(self) -> dict[str, Any] | None:
         """The area's no-fly zones as GeoJSON, None if there are none."""
         here = self._followed
@@ -216,7 +197,7 @@ class LiveCoverage(Background):
 
     def planning_fovs_deg(self, heights_over_level_ground: bool) -> dict[str, float]:
         """Vehicle with placed pictures -> field of view to plan with, as `planning_fov_rad` has it, degrees."""
-        return planning_fovs_deg(self._result.placed, heights_over_level_ground=heights_over_level_ground)
+        return planning_fovs_deg(self.result.placed, heights_over_level_ground=heights_over_level_ground)
 
     # -- the thread -----------------------------------------------------------------------------------------------
 
@@ -239,7 +220,7 @@ class LiveCoverage(Background):
         source = area_source(self._console.plan(), self._plans)
         if source is None or source == self._refused:
             self._fresh.clear()
-            gone, self._followed, self._result = self._followed is not None, None, _NOTHING
+            gone, self._followed, self.result = self._followed is not None, None, _NOTHING
             return gone
         epsg = None if self._drawer.area is None else self._drawer.area.epsg
         here = self._followed
@@ -306,7 +287,7 @@ class LiveCoverage(Background):
 
     def _follow(self, here: _Followed) -> bool:
         """Track the vehicles; returns whether the due cells have changed."""
-        rows = self._vehicles.latest
+        rows = self._on_links()
         grid = here.covered.area.grid
         for row in rows:
             self.battery.look(row, flies(row), time.monotonic())
@@ -344,14 +325,14 @@ class LiveCoverage(Background):
         here = self._followed
         began, cpu = time.monotonic(), time.thread_time()
         self._version += 1
-        self._result = _NOTHING if here is None else self._found(here)
+        self.result = _NOTHING if here is None else self._found(here)
         self.seconds = time.monotonic() - began
         self._rest_until = time.monotonic() + _LEAST_PAUSE * (time.thread_time() - cpu)
-        found = self._result.document
+        found = self.result.document
         told: dict[str, Any] = {key: found[key] for key in _TOLD}
-        self._events.publish(CoverageChanged({"gaps": len(found["gaps"]), **told}))
+        self._events.tell("coverage", gaps=len(found["gaps"]), **told)
 
-    def _found(self, here: _Followed) -> _Result:
+    def _found(self, here: _Followed) -> CoverageResult:
         cover, grid = here.cover, here.covered.area.grid
         missing, doubts = self._missing(here)
         gaps = find_gaps(cover, missing, here.covered.flight, due=self._due)
@@ -359,7 +340,8 @@ class LiveCoverage(Background):
         states = cover.states(self._due)
         placed = [v for v in cover.views if v.placed]
         document: CoverageDocument = {
-            "state": self._state(cover), "version": self._version, "time": iso_time(time.time()),
+            "state": "complete" if self._due is True else "in flight" if cover.views else "planned",
+            "version": self._version, "time": iso_time(time.time()),
             "plan": here.covered.plan, **_shares(cover.shares(self._due)),  # type: ignore[typeddict-item]
             "recorded": _shares(here.recorded.shares(self._due)),
             "pictures": {"placed": len(placed), "recorded": len(cover.views) - len(placed)},
@@ -371,7 +353,7 @@ class LiveCoverage(Background):
             "small_gaps": {"count": gaps.small, "area_m2": round(gaps.small_m2, 1)},
             "missing_pictures": _missing_rows(missing), "warnings": [*_warnings(cover), *doubts],
         }  # fmt: skip
-        return _Result(document, {"type": "FeatureCollection", "features": features}, cells_png(states), placed)
+        return CoverageResult(document, {"type": "FeatureCollection", "features": features}, cells_png(states), placed)
 
     def _missing(self, here: _Followed) -> tuple[list[MissingPicture], list[str]]:
         """Missing pictures, and doubts about the camera events."""
@@ -381,11 +363,6 @@ class LiveCoverage(Background):
             last = max((event.time_s for event in events), default=0.0) - _ON_THE_WAY_S
             events = [event for event in events if event.time_s <= last]
         return missing_by_events(here.cover.views, events, self._views.rejected())
-
-    def _state(self, cover: CoverageGrid) -> str:
-        if self._due is True:
-            return "complete"
-        return "in flight" if cover.views else "planned"
 
 
 def _with_flaws(views: Iterable[View], flaws: FlawedPictures) -> list[View]:

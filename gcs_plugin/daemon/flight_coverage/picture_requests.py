@@ -22,7 +22,7 @@ from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage, Missin
 from gcs_plugin.daemon.intake.picture_intake import PictureIntake
 from gcs_plugin.daemon.intake.posted_pose import PostedPose, linked_pose
 from gcs_plugin.daemon.stoppable_thread import Background
-from gcs_plugin.daemon.store.daemon_events import Events, RequestsChanged
+from gcs_plugin.daemon.store.daemon_events import Events
 from gcs_plugin.daemon.store.frame_rows import dated_images, exposure_place, exposure_times, pose_near
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.fleet.fleet import Fleet
@@ -91,15 +91,12 @@ class PictureNames:
                 return "", "its files have other names than the pictures that have arrived"
             pictures = same_form
         found = [path for path in pictures if number_of(path) == number + self.shift]
-        same = [path for path in found if path.rpartition("/")[0] in self._folders(files)]
+        arrived = {path.rpartition("/")[0] for path in files if path.rpartition("/")[2] in self.images}
+        same = [path for path in found if path.rpartition("/")[0] in arrived]
         found = same or found
         if len(found) > 1:
             return "", f"several of its files have number {number + self.shift}"
         return (found[0], "") if found else ("", f"it has no picture file with number {number + self.shift}")
-
-    def _folders(self, files: Mapping[str, int]) -> set[str]:
-        """The folders with pictures that have arrived."""
-        return {path.rpartition("/")[0] for path in files if path.rpartition("/")[2] in self.images}
 
 
 def _form(name: str) -> str:
@@ -168,7 +165,7 @@ class FetchedPictures:
 
     def wanted(self) -> Iterable[WantedPicture]:
         """The pictures that were taken and have not arrived."""
-        return wanted_pictures(self._coverage.document["missing_pictures"])
+        return wanted_pictures(self._coverage.result.document["missing_pictures"])
 
     def names(self, vehicle: str) -> PictureNames:
         """The names of a vehicle's pictures that have arrived, and how their numbers match its camera events."""
@@ -185,15 +182,12 @@ class FetchedPictures:
 
     def changed(self) -> None:
         """Tell the pages that a request's state has changed."""
-        self._events.publish(RequestsChanged())
+        self._events.tell("requests")
 
     def _event_pose(self, wanted: WantedPicture, name: str) -> PostedPose:
         """The position of a camera event, with height and angles of the vehicle's picture nearest in time.
 
         For pictures that the links' poses, which go back some minutes, do not reach.
-
-        Raises:
-            InputError: the event has no position.
         """
         place = exposure_place(self._journal, wanted.vehicle, wanted.number, wanted.time_s)
         if place is None:

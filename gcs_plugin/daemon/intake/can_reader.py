@@ -32,11 +32,7 @@ _log = logging.getLogger(__name__)
 
 
 def check_bus(bus: str) -> None:
-    """Check the name of a bus without opening it.
-
-    Raises:
-        InputError: there is no such kind of bus.
-    """
+    """Check the name of a bus without opening it; raises InputError: there is no such kind of bus."""
     import can
 
     kind, _, channel = bus.partition(":")
@@ -53,14 +49,7 @@ class CanReader(Background):
     """Reads one vehicle's bus in its own thread."""
 
     def __init__(
-        self,
-        vehicle: str,
-        bus: str,
-        *,
-        poses: LivePoses,
-        events: Events,
-        fleet: "Fleet",
-        system: int | None,
+        self, vehicle: str, bus: str, *, poses: LivePoses, events: Events, fleet: "Fleet", system: int | None
     ) -> None:
         """Make ready to read.
 

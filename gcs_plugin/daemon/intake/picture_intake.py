@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from gcs_plugin.daemon.intake.posted_pose import PostedPose, frame_of, linked_pose
-from gcs_plugin.daemon.store.daemon_events import Events, PictureRefused, PictureRejected, PictureStored
+from gcs_plugin.daemon.store.daemon_events import Events, PictureRejected, PictureStored
 from gcs_plugin.daemon.store.frame_rows import add_frame, frame_by_key
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.picture_store import PictureStore, frame_key, picture_size
 from gcs_plugin.daemon.store.sortie_rows import present_sortie
-from gcs_plugin.daemon.store.workspace_lock import require_space
 from gcs_plugin.links.tlog_writer import write_link_log
 from orthoswarm.export.product_files import iso_time
 from orthoswarm.model.errors import OrthoSwarmError, StorageError
@@ -46,11 +45,7 @@ class _Refusals:
 
 
 class RefusedPictures:
-    """Counts them since the daemon's start; any thread.
-
-    Args:
-        events: told of each. clock: UTC epoch seconds.
-    """
+    """Counts them since the daemon's start; any thread; `events`: told of each. `clock`: UTC epoch seconds."""
 
     def __init__(self, events: Events, clock: Callable[[], float] = time.time) -> None:
         self._events, self._clock = events, clock
@@ -58,16 +53,12 @@ class RefusedPictures:
         self._by_cause: dict[str, _Refusals] = {}
 
     def note(self, cause: str, reason: str, vehicle: str = "", image: str = "") -> None:
-        """Count one.
-
-        Args:
-            cause: one of CAUSES. reason: in a sentence. vehicle, image: as far as known.
-        """
+        """Count one; `cause`: one of CAUSES. `reason`: in a sentence. `vehicle, image`: as far as known."""
         with self._lock:
             before = self._by_cause.get(cause)
             count = 1 if before is None else before.count + 1
             self._by_cause[cause] = _Refusals(count, vehicle, image, reason, self._clock())
-        self._events.publish(PictureRefused(cause, count, vehicle, image, reason))
+        self._events.tell("refused", cause=cause, count=count, vehicle=vehicle, image=image, reason=reason)
 
     def picture_rejected(self, event: PictureRejected) -> None:
         """Count a stored picture that cannot be on the map."""
@@ -143,7 +134,7 @@ class PictureIntake:
             return known[0], False
         width, height, suffix = picture_size(data)
         pose = self._with_fix(pose)
-        require_space(self._store.folder.parent, len(data))
+        self._store.require_space(len(data))
         time_s = came if pose.time_s is None else pose.time_s
         path, size = self._store.put(key, suffix, data), (width, height)
         values = pose.values | ({"origin": pose.origin} if pose.origin else {})

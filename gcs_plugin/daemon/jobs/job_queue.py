@@ -5,46 +5,32 @@ journal change that also marks it as done. Refinements have their own threads; b
 joint refinements of neighbours, tones, exports, comparisons with the basemap) run one at a time in another thread. They
 start only while no refinement waits or runs, and give way to one that begins; drawing a layer again does not wait.
 `JobRequests` asks for jobs when something has happened: a leg is over, a mission complete, a refinement done.
+`LegWatch` detects legs that are over in flight, and vehicles that fall silent.
 """
 
 import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, TypeVar
 
-from gcs_plugin.daemon.jobs.leg_watch import LegWatch
+import numpy as np
+
+from gcs_plugin.config import SORTIE
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.jobs.workspace_products import FORMATS, PRODUCTS
-from gcs_plugin.daemon.store.daemon_events import (
-    CardRead,
-    Events,
-    FirstPicturesCame,
-    JobChanged,
-    JobEnded,
-    LegsOver,
-    MissionNoted,
-    Problem,
-    VehicleSilent,
-)
+from gcs_plugin.daemon.stoppable_thread import Background
+from gcs_plugin.daemon.store import daemon_events as happened
+from gcs_plugin.daemon.store import job_rows
+from gcs_plugin.daemon.store.daemon_events import Events
 from gcs_plugin.daemon.store.frame_rows import Whose, late_frames, newest_seq, photographed_sorties, unplaced_frames
-from gcs_plugin.daemon.store.job_rows import (
-    Job,
-    find_job,
-    interrupted_jobs_queued,
-    job_ended,
-    job_started,
-    latest_jobs,
-    new_job,
-    open_jobs,
-    queued_jobs,
-    refinement_is_open,
-    waiting_jobs_dropped,
-)
+from gcs_plugin.daemon.store.job_rows import Job
 from gcs_plugin.daemon.store.journal import Change, Journal, all_changes
 from gcs_plugin.daemon.store.sortie_rows import complete_sorties, is_complete, present_sortie
+from orthoswarm.model.earth import DEGREE_M
 from orthoswarm.model.errors import InputError, OrthoSwarmError, StorageError, WorkerStoppedError
+from orthoswarm.trajectory.legs import ended_legs
 
 Result = TypeVar("Result")
 
@@ -85,7 +71,7 @@ class RunningJob:
     def report(self, share: float, message: str) -> None:
         """Tell the pages its progress, 0 to 1, and what is being done."""
         self.job.progress, self.job.message = share, message
-        self._events.publish(JobChanged(self.job.document()))
+        self._events.tell("job", **self.job.document())
 
     def run(self, function: Callable[[Any], Result], item: Any) -> Result:
         """Run a function of one argument in a worker process, see `WorkerPool.run`.
@@ -115,7 +101,7 @@ class Jobs:
     """The queue of jobs.
 
     Args:
-        events: hears of every change; see JobChanged, JobEnded.
+        events: hears of every change, and JobEnded.
         handlers: kind -> function that does the job.
         workers: compute refinements, as many at once as it has processes. Two more may be at a step that needs none
             (waiting for a vehicle's last pictures, publishing). background: computes the others, and nothing else.
@@ -140,7 +126,7 @@ class Jobs:
             for n in range(workers.count + _WAITING_THREADS)
         ]
         self._threads.append(threading.Thread(target=self._run, args=(True,), name="background jobs", daemon=True))
-        journal.write(interrupted_jobs_queued)
+        journal.write(job_rows.interrupted_jobs_queued)
 
     def start(self) -> None:
         """Start working."""
@@ -161,14 +147,14 @@ class Jobs:
 
     def add(self, kind: str, vehicle: str | None = None, sortie: int | None = None, **detail: Any) -> Job:
         """Queue a job; returns an equal waiting one if there is one."""
-        job = self._journal.write(new_job(kind, vehicle, sortie, detail))
-        self._events.publish(JobChanged(job.document()))
+        job = self._journal.write(job_rows.new_job(kind, vehicle, sortie, detail))
+        self._events.tell("job", **job.document())
         self.wake()
         return job
 
     def drop(self, kind: str, vehicle: str, why: str) -> None:
         """Cancel a vehicle's jobs of a kind: waiting ones end at once, a running one is abandoned."""
-        self._journal.write(waiting_jobs_dropped(kind, vehicle, why))
+        self._journal.write(job_rows.waiting_jobs_dropped(kind, vehicle, why))
         with self._condition:
             found = [run for run in self._running.values() if (run.job.kind, run.job.vehicle) == (kind, vehicle)]
             dropped = [run for run in found if "after" not in run.job.detail]
@@ -183,7 +169,7 @@ class Jobs:
 
     def all(self) -> list[Job]:
         """The latest jobs, oldest first."""
-        found = latest_jobs(self._journal, _MOST_LISTED)
+        found = job_rows.latest_jobs(self._journal, _MOST_LISTED)
         with self._condition:
             return [self._running[job.id].job if job.id in self._running else job for job in found]
 
@@ -193,11 +179,11 @@ class Jobs:
 
     def find(self, number: int) -> Job | None:
         """A job by its number."""
-        return find_job(self._journal, number)
+        return job_rows.find_job(self._journal, number)
 
     def open(self, *kinds: str) -> int:
         """Number of waiting and running jobs of these kinds (all, if none is given), without coarse maps in flight."""
-        return sum(not kinds or kind in kinds for kind in open_jobs(self._journal))
+        return sum(not kinds or kind in kinds for kind in job_rows.open_jobs(self._journal))
 
     # -- the threads ----------------------------------------------------------------------------------------------
 
@@ -220,7 +206,7 @@ class Jobs:
 
     def _next(self, background: bool) -> RunningJob | None:
         """Take the next background job, or the next refinement; the jobs of a vehicle run one after the other."""
-        queued = queued_jobs(self._journal)
+        queued = job_rows.queued_jobs(self._journal)
         busy = {_lane(run.job) for run in self._running.values()}
         refining = any(kind == "refine" for kind, _ in busy) or any(job.kind == "refine" for job in queued)
         for job in queued:
@@ -239,8 +225,8 @@ class Jobs:
         if job.kind == "refine":
             job.detail["newest_seq"] = newest_seq(self._journal)  # pictures that arrive later are late
             self._make_way(job)
-        self._journal.write(job_started(job))
-        self._events.publish(JobChanged(job.document()))
+        self._journal.write(job_rows.job_started(job))
+        self._events.tell("job", **job.document())
         try:
             outcome = self._outcome(run)
             if outcome is None or not self._write_end(*outcome):
@@ -251,9 +237,9 @@ class Jobs:
                 self._running.pop(job.id, None)
                 self._unwanted.pop(job.id, None)
                 self._condition.notify_all()
-        self._events.publish(JobChanged(ended.document()))
+        self._events.tell("job", **ended.document())
         try:
-            self._events.publish(JobEnded(ended))
+            self._events.publish(happened.JobEnded(ended))
         except OrthoSwarmError as error:
             _log.error("after job %d: %s", job.id, error)
 
@@ -273,7 +259,7 @@ class Jobs:
             if self._stop.is_set():
                 return None
             ended = replace(job, state="done", progress=1.0, message="", ended=time.time())
-            return ended, all_changes(change, job_ended(ended))
+            return ended, all_changes(change, job_rows.job_ended(ended))
         except Exception as error:
             if self._stop.is_set():  # its worker was stopped
                 return None
@@ -283,7 +269,7 @@ class Jobs:
                 ended = replace(job, state="queued", progress=0.0, started=None, attempts=job.attempts - 1)
             else:
                 ended = _failed(job, error)
-            return ended, job_ended(ended)
+            return ended, job_rows.job_ended(ended)
 
     def _write_end(self, job: Job, change: Change) -> bool:
         """Write a job's end, retrying while the disk is full; False if the daemon stops before that."""
@@ -293,7 +279,7 @@ class Jobs:
             except StorageError as error:
                 if not self.problem:
                     _log.error("the end of job %d (%s) waits: %s", job.id, job.kind, error)
-                    self._events.publish(Problem(str(error)))
+                    self._events.tell("problem", text=str(error))
                 self.problem = str(error)
             else:
                 self.problem = ""
@@ -318,6 +304,93 @@ def _lane(job: Job) -> tuple[str, str | None]:
     return ("background", None) if job.kind in _BACKGROUND else (job.kind, job.vehicle)
 
 
+_LOOK_S: Final = 0.5
+
+
+@dataclass(slots=True)
+class _Path:
+    """Times and positions of a sortie's pictures since the last leg that was asked for."""
+
+    times: list[float] = field(default_factory=list)
+    places: list[tuple[float, float]] = field(default_factory=list)
+    heard: float = 0.0
+    dirty: bool = False
+
+
+class LegWatch(Background):
+    """Watches the paths of all vehicles, in a thread.
+
+    Args:
+        events: told of finished legs, and of a vehicle that falls silent, however few pictures it sent before.
+
+    Attributes:
+        silent_s: a vehicle is silent when no picture has arrived for so long, seconds.
+    """
+
+    def __init__(self, events: Events, *, silent_s: float) -> None:
+        super().__init__("legs")
+        self._events, self.silent_s = events, silent_s
+        self._lock = threading.Lock()
+        self._paths: dict[tuple[str, int], _Path] = {}
+
+    def picture_stored(self, event: happened.PictureStored) -> None:
+        """Record a picture that has come; one without a position says nothing of the path."""
+        if event.has_fix:
+            frame = event.frame
+            time_s = event.arrived_s if frame.time_s is None else frame.time_s
+            self.add(frame.vehicle, event.sortie, time_s, frame.fix.lat_deg, frame.fix.lon_deg)
+
+    def add(self, vehicle: str, sortie: int, time_s: float, lat_deg: float, lon_deg: float) -> None:
+        """Record a picture; any thread."""
+        with self._lock:
+            path = self._paths.setdefault((vehicle, sortie), _Path())
+            path.times.append(time_s)
+            path.places.append((lat_deg, lon_deg))
+            path.heard, path.dirty = time.monotonic(), True
+
+    def _run(self) -> None:
+        while not self._stop.wait(min(_LOOK_S, 0.25 * self.silent_s)):
+            now = time.monotonic()
+            with self._lock:
+                due = [
+                    (key, path)
+                    for key, path in self._paths.items()
+                    if (path.dirty and len(path.times) >= SORTIE.coarse_map_pictures)
+                    or 0 < path.heard < now - self.silent_s
+                ]
+            for key, path in due:
+                try:
+                    self._look(key, path, now)
+                except Exception:  # an error in one path must not end the watch of the others
+                    _log.exception("the legs of %s", key[0])
+
+    def _look(self, key: tuple[str, int], path: _Path, now: float) -> None:
+        with self._lock:
+            order = sorted(range(len(path.times)), key=path.times.__getitem__)
+            times = [path.times[k] for k in order]
+            places = [path.places[k] for k in order]
+            silent = now - path.heard > self.silent_s
+            path.dirty = False
+            if silent:
+                path.heard = 0.0  # reported once
+        if silent:
+            self._events.publish(happened.VehicleSilent(*key))
+        if len(times) < SORTIE.coarse_map_pictures:
+            return
+        lat, lon = np.array(places).T
+        north = (lat - lat[0]) * DEGREE_M
+        east = (lon - lon[0]) * DEGREE_M * np.cos(np.radians(lat[0]))
+        legs = ended_legs(np.column_stack([east, north]), np.array(times), over=silent)
+        if sum(last + 1 - first for first, last in legs) < SORTIE.coarse_map_pictures:
+            return
+        with self._lock:
+            past = set(times[: legs[-1][1] + 1])
+            keep = [k for k, t in enumerate(path.times) if t not in past]
+            path.times = [path.times[k] for k in keep]
+            path.places = [path.places[k] for k in keep]
+        self._events.publish(happened.LegsOver(*key, silent))
+
+
 class JobRequests:
     """Asks for jobs; coarse: in flight, too. basemap: there is one, with which written products are compared."""
 
@@ -338,11 +411,7 @@ class JobRequests:
         return [self._jobs.add("refine", *whose) for whose in wanted]
 
     def export(self, formats: list[str]) -> Job:
-        """Queue an export.
-
-        Raises:
-            InputError: an unknown format.
-        """
+        """Queue an export; raises InputError: an unknown format."""
         unknown = [name for name in formats if name not in FORMATS]
         if unknown or not formats:
             raise InputError(f"there is no format {unknown or 'given'}; choose from: {', '.join(FORMATS)}")
@@ -358,39 +427,39 @@ class JobRequests:
 
     # -- what has happened ----------------------------------------------------------------------------------------
 
-    def first_pictures_came(self, event: FirstPicturesCame) -> None:
+    def first_pictures_came(self, event: happened.FirstPicturesCame) -> None:
         """Have a vehicle looked for on the basemap."""
         if self._coarse and not is_complete(self._journal, (event.vehicle, event.sortie)):
             self._jobs.add("coarse", event.vehicle, event.sortie, first=True)
 
-    def legs_over(self, event: LegsOver) -> None:
+    def legs_over(self, event: happened.LegsOver) -> None:
         """Queue the coarse map of a sortie that is still flown; on a basemap it is registered picture by picture."""
         whose = (event.vehicle, event.sortie)
         if self._coarse and not self._basemap and not is_complete(self._journal, whose):
             self._jobs.add("coarse", event.vehicle, event.sortie, **({"over": True} if event.silent else {}))
 
-    def vehicle_silent(self, event: VehicleSilent) -> None:
+    def vehicle_silent(self, event: happened.VehicleSilent) -> None:
         """Have late pictures placed that came over a slow link; before a refinement, have all tracked for it."""
         whose = (event.vehicle, event.sortie)
         self._refine_late(whose)
         if self._coarse and self._basemap and not is_complete(self._journal, whose):
             self._jobs.add("coarse", *whose, over=True)
 
-    def card_read(self, event: CardRead) -> None:
+    def card_read(self, event: happened.CardRead) -> None:
         """Have the sortie refined with the pictures of a card that was read after landing."""
         self._refine_late((event.vehicle, present_sortie(self._journal, event.vehicle)))
 
     def _refine_late(self, whose: Whose) -> None:
-        if not refinement_is_open(self._journal, whose, "queued") and late_frames(self._journal, *whose):
+        if not job_rows.refinement_is_open(self._journal, whose, "queued") and late_frames(self._journal, *whose):
             self._jobs.add("refine", *whose, trigger="late")
 
-    def mission_noted(self, event: MissionNoted) -> None:
+    def mission_noted(self, event: happened.MissionNoted) -> None:
         """Begin the refinement that a completion has queued; the vehicle's coarse maps are not needed any more."""
         if event.kind == "complete":
             self._jobs.drop("coarse", event.vehicle, _COMPLETE)
         self._jobs.wake()
 
-    def job_ended(self, event: JobEnded) -> None:
+    def job_ended(self, event: happened.JobEnded) -> None:
         """Export the products again once nothing is left to refine, then compare them with the map."""
         job = event.job
         written = job.kind == "export" and job.state == "done" and "after" in job.detail

@@ -18,18 +18,12 @@ from gcs_plugin.daemon.jobs.publisher import Publisher, detail_of, frames_of
 from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.jobs.worker_tasks import SortieResult, SortieTask, coarse_after, follow, look_for, near, place
 from gcs_plugin.daemon.layers.live_registration import MOST_LOOKED_FOR
+from gcs_plugin.daemon.store import sortie_rows
 from gcs_plugin.daemon.store.daemon_events import Events, VehicleLookedFor
 from gcs_plugin.daemon.store.job_rows import Job, refinement_is_open
 from gcs_plugin.daemon.store.journal import Change, no_change
 from gcs_plugin.daemon.store.picture_store import KeptPictures, PictureStore
-from gcs_plugin.daemon.store.sortie_rows import (
-    LegRow,
-    PlacedSortie,
-    is_complete,
-    legs_placed,
-    placed_sortie,
-    shown_sorties,
-)
+from gcs_plugin.daemon.store.sortie_rows import LegRow, PlacedSortie
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError, StorageError, WorkerStoppedError
 from orthoswarm.model.frame import Frame
@@ -106,7 +100,7 @@ class LegPlacement:
         if not frames:
             raise OrthoSwarmError("no leg is over yet")
         run.report(0.1, f"{len(frames)} pictures, {count} legs")
-        before = placed_sortie(publisher.journal, "coarse", job.whose)
+        before = sortie_rows.placed_sortie(publisher.journal, "coarse", job.whose)
         task = publisher.task(
             target,
             frames=frames,
@@ -135,23 +129,23 @@ class LegPlacement:
         """Drawn sorties near a box, whose exposure is fixed."""
         return [
             self.publisher.solutions / row.path
-            for row in shown_sorties(self.publisher.journal, "coarse")
+            for row in sortie_rows.shown_sorties(self.publisher.journal, "coarse")
             if row.whose != job.whose and row.bounds.gap_m(box) < _REACH_M
         ]
 
     def _is_refined(self, job: Job) -> bool:
         """Whether a refinement has replaced, or is about to replace, the result."""
         journal = self.publisher.journal
-        if is_complete(journal, job.whose) or refinement_is_open(journal, job.whose, "queued", "running"):
+        if sortie_rows.is_complete(journal, job.whose) or refinement_is_open(journal, job.whose, "queued", "running"):
             return True
-        row = placed_sortie(journal, "solutions", job.whose)
+        row = sortie_rows.placed_sortie(journal, "solutions", job.whose)
         return row is not None and row.detail["layer"] == "coarse"
 
     # -- after a refinement ---------------------------------------------------------------------------------------
 
     def _after(self, run: RunningJob, target: Path) -> None:
         """Place the complete sortie on the coarse layer, from the start values of its refinement."""
-        row = placed_sortie(self.publisher.journal, "solutions", run.job.whose)
+        row = sortie_rows.placed_sortie(self.publisher.journal, "solutions", run.job.whose)
         if row is None or row.detail["layer"] != "fine":
             return
         run.report(0.1, "the coarse layer beside the refined one")
@@ -162,7 +156,7 @@ class LegPlacement:
 
     def _publish(self, run: RunningJob, target: Path, solved: SortieResult, legs: list[LegRow]) -> None:
         job, publisher = run.job, self.publisher
-        old = placed_sortie(publisher.journal, "coarse", job.whose)
+        old = sortie_rows.placed_sortie(publisher.journal, "coarse", job.whose)
         changed = solved.changed
         if old is not None and "after" in job.detail:
             changed = BoundingBox.around([changed, old.bounds])
@@ -173,7 +167,7 @@ class LegPlacement:
             if "after" not in job.detail and self._is_refined(job):
                 raise OrthoSwarmError("a refinement takes its place")
             rejected = turn.draw(run, job.whose, target, changed)
-            job.detail |= turn.publish(legs_placed(placed, sigmas, rejected))
+            job.detail |= turn.publish(sortie_rows.legs_placed(placed, sigmas, rejected))
         publisher.retire(old)
         publisher.tell("coarse", job)
 

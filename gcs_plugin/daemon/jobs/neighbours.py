@@ -25,15 +25,10 @@ from gcs_plugin.daemon.jobs.job_queue import RunningJob
 from gcs_plugin.daemon.jobs.publisher import Publisher, detail_of, refined_change
 from gcs_plugin.daemon.jobs.solution_file import Bytes, Gain, SolutionFile, read_solution, uniquely_named
 from gcs_plugin.daemon.jobs.worker_tasks import refine_jointly
+from gcs_plugin.daemon.store import sortie_rows
 from gcs_plugin.daemon.store.job_rows import Job, new_job
 from gcs_plugin.daemon.store.journal import Change, no_change
-from gcs_plugin.daemon.store.sortie_rows import (
-    PlacedSortie,
-    placed_sortie,
-    shown_sorties,
-    solution_paths,
-    solution_replaced,
-)
+from gcs_plugin.daemon.store.sortie_rows import PlacedSortie
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.mosaic.extent import ground_of_nearest
@@ -120,8 +115,8 @@ class ToneBalance:
 
     def _balance(self, run: RunningJob) -> None:
         publisher, detail = self.publisher, run.job.detail
-        refined = solution_paths(publisher.journal, "solutions")
-        shown = [row for row in shown_sorties(publisher.journal, publisher.refined) if row.whose in refined]
+        refined = sortie_rows.solution_paths(publisher.journal, "solutions")
+        shown = [row for row in sortie_rows.shown_sorties(publisher.journal, publisher.refined) if row.whose in refined]
         if len({row.vehicle for row in shown}) < 2:
             detail["note"] = "there is one vehicle only"
             return
@@ -146,7 +141,7 @@ class ToneBalance:
             if now is None or now.path != before.path:
                 return False
             turn.draw(run, before.whose, target, before.bounds)
-            turn.publish(solution_replaced(before.whose, target.name))
+            turn.publish(sortie_rows.solution_replaced(before.whose, target.name))
         publisher.retire(before)
         return True
 
@@ -177,7 +172,7 @@ class JointRefinement:
     def _solve(self, run: RunningJob, target: Path) -> str:
         """Solve and publish; returns why nothing changes, empty if something does."""
         job, publisher = run.job, self.publisher
-        row = placed_sortie(publisher.journal, "solutions", job.whose)
+        row = sortie_rows.placed_sortie(publisher.journal, "solutions", job.whose)
         if row is None or publisher.basemap is None or row.detail["layer"] != "fine":
             return "it was not refined on the map"
         others = list(publisher.refined_near(job.whose, row.bounds).values())
@@ -197,7 +192,7 @@ class JointRefinement:
         if moved_m < self.least_px * publisher.area().gsd_m:
             return "it agrees with its neighbours already"
         with publisher.turn("fine") as turn:
-            now = placed_sortie(publisher.journal, "solutions", job.whose)
+            now = sortie_rows.placed_sortie(publisher.journal, "solutions", job.whose)
             if now is None or now.path != row.path:
                 return "it was refined again meanwhile"
             run.report(0.7, "drawing")

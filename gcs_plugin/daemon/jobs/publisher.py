@@ -18,23 +18,13 @@ from gcs_plugin.daemon.jobs.solution_file import Bytes, is_readable, thumbnail_o
 from gcs_plugin.daemon.jobs.worker_tasks import DrawTask, SortieResult, SortieTask, draw
 from gcs_plugin.daemon.layers.layers import MapArea, MapLayer, new_name
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
+from gcs_plugin.daemon.store import sortie_rows
 from gcs_plugin.daemon.store.daemon_events import Events, LayerPublished
 from gcs_plugin.daemon.store.frame_rows import Whose, sortie_frames
 from gcs_plugin.daemon.store.job_rows import Job, job_done
 from gcs_plugin.daemon.store.journal import Change, Journal, all_changes, fact_change, no_change
 from gcs_plugin.daemon.store.picture_store import PictureStore
-from gcs_plugin.daemon.store.sortie_rows import (
-    REFINED,
-    LegRow,
-    PlacedSortie,
-    SortieDetail,
-    Table,
-    placed_sorties,
-    placements_forgotten,
-    shown_sorties,
-    solution_paths,
-    sortie_refined,
-)
+from gcs_plugin.daemon.store.sortie_rows import REFINED, LegRow, PlacedSortie, SortieDetail, Table
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.export.json_values import finite
 from orthoswarm.model.bounding_box import BoundingBox
@@ -82,7 +72,7 @@ class Publisher:
         """Open the published generation of a layer; False if it cannot be trusted and is dropped."""
         generation = self.journal.fact(layer)
         if generation is None:
-            return not shown_sorties(self.journal, layer)
+            return not sortie_rows.shown_sorties(self.journal, layer)
         try:
             if not trusted:
                 raise OrthoSwarmError("its last pixels may have been lost in the power cut")
@@ -96,12 +86,16 @@ class Publisher:
     def _forget_outdated(self) -> list[Whose]:
         """Forget solutions that cannot be read, with their layers; returns the refined sorties among them."""
         outdated = {
-            table: [row for row in placed_sorties(self.journal, table) if not is_readable(self.solutions / row.path)]
+            table: [
+                row
+                for row in sortie_rows.placed_sorties(self.journal, table)
+                if not is_readable(self.solutions / row.path)
+            ]
             for table in _TABLES
         }
         if not any(outdated.values()):
             return []
-        self.journal.write(placements_forgotten(outdated))
+        self.journal.write(sortie_rows.placements_forgotten(outdated))
         refined = [row.whose for row in outdated["solutions"]]
         _log.warning(
             "the refined map was made by another version of the program; %d sorties are refined again", len(refined)
@@ -110,7 +104,7 @@ class Publisher:
 
     def draw_again(self, run: RunningJob) -> Change:
         """The handler of `redraw`: draws the lost layers from the solution files."""
-        todo = [(layer, row.whose) for layer in self.lost for row in shown_sorties(self.journal, layer)]
+        todo = [(layer, row.whose) for layer in self.lost for row in sortie_rows.shown_sorties(self.journal, layer)]
         for n, (layer, whose) in enumerate(todo):
             with self.turn(layer) as turn:
                 row = self.shown(layer, whose)
@@ -134,14 +128,10 @@ class Publisher:
 
     def _named(self) -> set[str]:
         """The solution files that the journal names."""
-        return {path for table in _TABLES for path in solution_paths(self.journal, table).values()}
+        return {path for table in _TABLES for path in sortie_rows.solution_paths(self.journal, table).values()}
 
     def area(self) -> MapArea:
-        """The map's area.
-
-        Raises:
-            OrthoSwarmError: there is no map yet.
-        """
+        """The map's area; raises OrthoSwarmError: there is no map yet."""
         if self._drawer.area is None:
             raise OrthoSwarmError("there is no map yet; wait for pictures")
         return self._drawer.area
@@ -178,7 +168,7 @@ class Publisher:
         """The solution files of the refined sorties (except that one) whose ground is within a distance of a box."""
         return {
             row.whose: self.solutions / row.path
-            for row in placed_sorties(self.journal, "solutions")
+            for row in sortie_rows.placed_sorties(self.journal, "solutions")
             if row.whose != whose and row.bounds.gap_m(box) < reach_m
         }
 
@@ -189,7 +179,7 @@ class Publisher:
 
     def shown(self, layer: str, whose: Whose) -> PlacedSortie | None:
         """A sortie on a layer, None if it is not there."""
-        return next((row for row in shown_sorties(self.journal, layer) if row.whose == whose), None)
+        return next((row for row in sortie_rows.shown_sorties(self.journal, layer) if row.whose == whose), None)
 
     def retire(self, row: PlacedSortie | None) -> None:
         """Remove the solution file of what was replaced, later, as others may be reading it."""
@@ -223,7 +213,7 @@ class LayerTurn:
         publisher = self._publisher
         others = [
             publisher.solutions / row.path
-            for row in shown_sorties(publisher.journal, self._layer)
+            for row in sortie_rows.shown_sorties(publisher.journal, self._layer)
             if row.whose != whose and row.bounds.overlaps(changed)
         ]
         canvas = publisher.layers[self._layer].canvas
@@ -279,5 +269,7 @@ def refined_change(
         job: whose sortie it is. solved: with stages and sigmas of the new frames.
         rejected: image -> why it could not be drawn. name: of the solution file. detail: stored with it.
     """
-    stands = sortie_refined(PlacedSortie(*job.whose, name, detail), solved.stages, {**solved.dropped, **rejected})
+    stands = sortie_rows.sortie_refined(
+        PlacedSortie(*job.whose, name, detail), solved.stages, {**solved.dropped, **rejected}
+    )
     return all_changes(stands, job_done(job.id))

@@ -54,11 +54,7 @@ class SolutionFile:
         return self.solution.terrain or Terrain.flat(self.solution.ground_z_m)
 
     def write(self, path: Path) -> None:
-        """Write it completely and synced, or not at all.
-
-        Raises:
-            StorageError: the disk is full.
-        """
+        """Write it completely and synced, or not at all; raises StorageError: the disk is full."""
         with atomic_write(path) as part, part.open("wb") as file:
             file.write(_header())
             pickle.dump(self, file, pickle.HIGHEST_PROTOCOL)

@@ -1,6 +1,8 @@
-"""Worker processes of the daemon: started in advance, of low priority, ended with the daemon in any case."""
+"""Worker processes of the daemon, of low priority, ended with it in any case; and the one that compiles kernels."""
 
 import os
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future, ProcessPoolExecutor
@@ -9,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+from gcs_plugin.daemon.store.daemon_events import Events
+from orthoswarm.compute.compile_kernels import MADE_FOR, load_kernels
 from orthoswarm.compute.workers import Usage, prepare_worker, spawn_context
 from orthoswarm.model.errors import OrthoSwarmError, WorkerStoppedError
 
@@ -33,26 +37,17 @@ class WorkerPool:
         self._free = threading.BoundedSemaphore(self.count)
         self._reserved = threading.local()
         self._pool: ProcessPoolExecutor | None = None
-        self._closed = self._started = self._warm = False
+        self._closed = self._started = False
         self._ended_cpu_s = 0.0
 
     def warm_up(self) -> None:
-        """Start the processes, once, and let them import the needed modules."""
+        """Start the processes, once, and let them load what a refinement needs."""
         with self._lock:
             if self._started or self._closed:
                 return
             self._started = True
         for _ in range(self.count):
-            self.submit(_import_all, 0)
-
-    def warm_kernels(self) -> None:
-        """Have a process load its compiled kernels, once, so that the first completed vehicle need not wait for it."""
-        with self._lock:
-            if self._warm or self._closed:
-                return
-            self._warm = True
-        for _ in range(self.count):
-            self.submit(_warm_kernels, 0)
+            self.submit(_load, 0)
 
     def submit(self, function: Callable[[Any], Result], item: Any) -> "Future[Result]":
         """Run a module-level function of one picklable argument."""
@@ -163,15 +158,12 @@ def _prepare(nice: int) -> None:
     prepare_worker()
 
 
-def _import_all(_: int) -> None:
+def _load(_: int) -> None:
+    """Import what a refinement needs, and load its kernels, which takes half a second."""
     import gcs_plugin.daemon.jobs.worker_tasks  # noqa: F401
     import orthoswarm.refine.strategy.swarm_refiner  # noqa: F401
 
-
-def _warm_kernels(_: int) -> None:
-    from gcs_plugin.daemon.jobs.kernel_warmup import refine_something
-
-    refine_something()
+    load_kernels("mosaic", "raster", "refine")
 
 
 def _used_by(pid: int) -> Usage:
@@ -183,3 +175,44 @@ def _used_by(pid: int) -> Usage:
         return Usage((int(ran[11]) + int(ran[12])) / os.sysconf("SC_CLK_TCK"), largest * 1024 / 1e6)
     except (OSError, ValueError, IndexError, AttributeError):
         return Usage()
+
+
+_COMMAND: Final = (sys.executable, "-m", "orthoswarm.compute.compile_kernels")
+_MEANWHILE: Final = "pictures are kept, and drawn and refined as soon as it is done"
+
+
+class GettingReady:
+    """Compiles in another process, which ends with this one.
+
+    Attributes:
+        problem: how far it is, in words; empty once the daemon is ready.
+    """
+
+    def __init__(self, events: Events) -> None:
+        self._events, self.problem = events, ""
+        self._process: subprocess.Popen[str] | None = None
+
+    def start(self) -> None:
+        """Start, unless the installation has its kernels."""
+        if MADE_FOR.exists():
+            return
+        self._process = subprocess.Popen(
+            _COMMAND, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        )
+        threading.Thread(target=self._follow, args=(self._process,), name="getting ready", daemon=True).start()
+
+    def close(self) -> None:
+        """Stop; what is compiled by then stays."""
+        if self._process is not None:
+            self._process.terminate()
+            self._process.wait()
+
+    def _follow(self, process: "subprocess.Popen[str]") -> None:
+        assert process.stderr is not None
+        with process.stderr as lines:
+            for line in lines:
+                self.problem = f"getting ready, {line.strip()}; {_MEANWHILE}"
+                self._events.tell("problem", text=self.problem)
+        self.problem = ""
+        text = "ready" if process.wait() == 0 else "kernels are compiled when they are needed"
+        self._events.tell("problem", text=text)

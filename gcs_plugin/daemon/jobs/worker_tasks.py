@@ -123,11 +123,7 @@ class _Watch:
 
 
 def solve(task: SortieTask) -> SortieResult:
-    """Refine one vehicle.
-
-    Raises:
-        OrthoSwarmError: its frames cannot be refined.
-    """
+    """Refine one vehicle; raises OrthoSwarmError: its frames cannot be refined."""
     watch = _Watch()
     others, basemap = task.read_neighbours(), task.open_basemap(task.frames)
     solution = without_strays(_refiner(task).refine(task.frames, [other.solution for other in others], basemap))
@@ -246,12 +242,7 @@ def place(task: SortieTask) -> SortieResult:
 
     watch = _Watch()
     options = replace(_options(task), kept=None)  # the next leg's tracks will be others
-    solution = place_in_flight(
-        task.frames,
-        epsg=task.epsg,
-        origin=np.array(task.origin),
-        options=options,
-    )
+    solution = place_in_flight(task.frames, epsg=task.epsg, origin=np.array(task.origin), options=options)
     mine = {frame.image for frame in task.frames}
     before = SolutionFile(replace(solution, placed=[])) if task.before is None else task.read_before()
     earlier = [p for p in before.solution.placed if p.frame.image not in mine]

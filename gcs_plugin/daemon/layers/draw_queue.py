@@ -125,10 +125,7 @@ class DrawQueue:
         if self._step_m == 0.0:  # the first frame sets the scale
             self._step_m = max(0.5, _STEP_SHARE * (fix.height_m or DEFAULT_HEIGHT_M))
             self._east_m = DEGREE_M * max(0.05, math.cos(math.radians(fix.lat_deg)))
-        return (
-            int(fix.lat_deg * DEGREE_M / self._step_m // 1),
-            int(fix.lon_deg * self._east_m / self._step_m // 1),
-        )
+        return (int(fix.lat_deg * DEGREE_M / self._step_m // 1), int(fix.lon_deg * self._east_m / self._step_m // 1))
 
     def _level(self, frame: Frame) -> int:
         """Rings of cells around a frame's nadir without a drawn one, at most LEVELS - 1."""

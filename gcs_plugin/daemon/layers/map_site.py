@@ -4,10 +4,11 @@ The basemap determines the location, else the newest plan, else the majority of 
 """
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 
@@ -64,26 +65,23 @@ class Anchor:
         return distance_m(lat_deg, lon_deg, min(max(lat_deg, south), north), min(max(lon_deg, west), east))
 
 
-class NewestPlan(Protocol):
-    """The plans of a workspace."""
-
-    def newest_bounds(self) -> tuple[float, float, float, float] | None:
-        """South, west, north, east of the newest plan in degrees, None if there is none."""
-
-
 @dataclass(frozen=True, slots=True)
 class ExpectedPlace:
-    """The location of the map before its first picture."""
+    """The location of the map before its first picture.
+
+    Attributes:
+        newest_plan: south, west, north, east of the newest plan in degrees, None if there is none.
+    """
 
     tiles: TileServer
-    plans: NewestPlan
+    newest_plan: Callable[[], tuple[float, float, float, float] | None]
 
     def place(self) -> Anchor | None:
         """The basemap, else the newest plan; None if the pictures decide."""
         basemap = self.tiles.basemap
         if basemap is not None:
             return Anchor.of_ground("the basemap", basemap.epsg, basemap.bounds)
-        found = self.plans.newest_bounds()
+        found = self.newest_plan()
         return None if found is None else Anchor("the newest plan", found)
 
 

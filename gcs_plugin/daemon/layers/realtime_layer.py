@@ -6,7 +6,6 @@ keeps up, frames are drawn in order of arrival. Under overload those that would 
 """
 
 import logging
-import shutil
 import sqlite3
 import threading
 import time
@@ -20,41 +19,21 @@ from numpy.typing import NDArray
 
 from gcs_plugin.daemon.intake.posted_pose import frame_of_row
 from gcs_plugin.daemon.layers.draw_queue import DrawQueue, MapDelay, PendingFrame
-from gcs_plugin.daemon.layers.layers import MapArea, new_name
+from gcs_plugin.daemon.layers.layers import MapArea
 from gcs_plugin.daemon.layers.live_registration import LiveRegistration
 from gcs_plugin.daemon.layers.map_site import MapSite
 from gcs_plugin.daemon.stoppable_thread import Background
-from gcs_plugin.daemon.store.daemon_events import (
-    DrawingRestarted,
-    Events,
-    FrameReported,
-    LayerDrawn,
-    Overload,
-    PictureDrawn,
-    PictureRejected,
-    PictureStored,
-    Problem,
-    VehicleLookedFor,
-)
-from gcs_plugin.daemon.store.frame_rows import (
-    POSE_KEYS,
-    Drawn,
-    DrawnAgain,
-    frames_drawn,
-    frames_moved,
-    sortie_is_drawn,
-    undrawn_before,
-    undrawn_frames,
-)
+from gcs_plugin.daemon.store import daemon_events as happened
+from gcs_plugin.daemon.store import frame_rows
+from gcs_plugin.daemon.store.daemon_events import Events
+from gcs_plugin.daemon.store.frame_rows import POSE_KEYS, Drawn, DrawnAgain
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.picture_store import PictureStore
-from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.compute.compile_kernels import load_kernels
 from orthoswarm.export.product_files import frame_row
-from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, rotation_from_angles
+from orthoswarm.model.camera import Camera
 from orthoswarm.model.errors import OrthoSwarmError, StorageError
-from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import PlacedFrame
-from orthoswarm.mosaic.realtime import RealtimeMosaic
 from orthoswarm.mosaic.render_passes import thumbnail
 from orthoswarm.raster.picture_file import read_rgba
 from orthoswarm.raster.picture_quality import PictureQuality, picture_quality
@@ -126,7 +105,7 @@ class Drawer(Background):
             self._condition.notify_all()
         super().close()
 
-    def picture_stored(self, event: PictureStored) -> None:
+    def picture_stored(self, event: happened.PictureStored) -> None:
         """Add a frame that is in the journal."""
         with self._condition:
             self._delay.came(event.frame.vehicle, event.arrived_s)
@@ -134,7 +113,7 @@ class Drawer(Background):
                 self._put(PendingFrame(event.seq, event.arrived_s, event.sortie, event.frame))
             self._condition.notify_all()
 
-    def vehicle_looked_for(self, event: VehicleLookedFor) -> None:
+    def vehicle_looked_for(self, event: happened.VehicleLookedFor) -> None:
         """Draw a vehicle's pictures again where they were found on the basemap."""
         self.registration.vehicle_looked_for(event)
         with self._condition:
@@ -160,7 +139,7 @@ class Drawer(Background):
     def wait_drawn(self, vehicle: str, sortie: int | None, timeout_s: float) -> bool:
         """Wait until a sortie's frames are drawn; False after the time-out."""
         end = time.monotonic() + timeout_s
-        while not sortie_is_drawn(self._journal, vehicle, sortie):
+        while not frame_rows.sortie_is_drawn(self._journal, vehicle, sortie):
             if time.monotonic() > end or self._stop.is_set():
                 return False
             time.sleep(0.05)
@@ -169,7 +148,7 @@ class Drawer(Background):
     # -- the thread -----------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        load_kernels(self._site.folder)
+        load_kernels("canvas", "mosaic.kernels", "raster")
         while True:
             with self._condition:
                 while not (len(self._queue) or self._more or self._found or self._stop.is_set()):
@@ -191,7 +170,7 @@ class Drawer(Background):
         if problem != self.problem:
             self.problem = problem
             _log.error("drawing waits: %s", problem)
-            self._events.publish(Problem(problem))
+            self._events.tell("problem", text=problem)
         with self._condition:
             self._waiting = self._queue.seqs()
             self._more = True
@@ -208,14 +187,14 @@ class Drawer(Background):
         if left and now - self._looked < self._look_s:
             return
         self._looked = now
-        before, self.put_off = self.put_off, undrawn_before(self._journal, time.time() - self._late_s)
+        before, self.put_off = self.put_off, frame_rows.undrawn_before(self._journal, time.time() - self._late_s)
         if bool(before) != bool(self.put_off):
             if self.put_off:
                 _log.warning("%s", self.overload)
             else:
                 _log.info("all pictures are on the map again")
         if before != self.put_off:
-            self._events.publish(Overload(self.put_off, self.overload))
+            self._events.tell("overload", put_off=self.put_off, text=self.overload)
 
     @property
     def overload(self) -> str:
@@ -233,7 +212,7 @@ class Drawer(Background):
                 return
             self._more = False
         most = self._in_memory + len(self._waiting) + 1
-        rows = undrawn_frames(self._journal, most)
+        rows = frame_rows.undrawn_frames(self._journal, most)
         with self._condition:
             self._more = self._more or len(rows) == most
             for row in rows:
@@ -266,8 +245,8 @@ class Drawer(Background):
             seqs.append(pending.seq)
             self._note(pending, result)
         if done:
-            self._journal.write(frames_drawn(done))
-            self._events.publish(LayerDrawn("realtime", self._site.layer.version))
+            self._journal.write(frame_rows.frames_drawn(done))
+            self._events.tell("layer", layer="realtime", version=self._site.layer.version)
         with self._condition:
             self._waiting.difference_update(seqs)
             self._condition.notify_all()
@@ -285,8 +264,8 @@ class Drawer(Background):
                 camera = self._document(pending, pose.camera, pose.ground_z_m, pose.sigma_m, "map")
                 done.append(DrawnAgain(pending.seq, pose.sigma_m, camera))
         if done:
-            self._journal.write(frames_moved(done))
-            self._events.publish(LayerDrawn("realtime", self._site.layer.version))
+            self._journal.write(frame_rows.frames_moved(done))
+            self._events.tell("layer", layer="realtime", version=self._site.layer.version)
 
     def _note(self, pending: PendingFrame, result: Drawn) -> None:
         took = time.time() - pending.arrived
@@ -299,7 +278,7 @@ class Drawer(Background):
         self.latency_sum += took
         del self.latencies[:-1000]
 
-    def draw_anew(self, _: DrawingRestarted) -> None:
+    def draw_anew(self, _: happened.DrawingRestarted) -> None:
         """All frames are drawn again, by what the journal says."""
         self._begun += 1
         self.registration.forget()
@@ -314,7 +293,7 @@ class Drawer(Background):
         try:
             place = self._site.place(frame, self.drawn)
             if isinstance(place, str):
-                self._events.publish(PictureRejected(frame, place, True))
+                self._events.publish(happened.PictureRejected(frame, place, True))
                 return self._report(pending, Drawn(pending.seq, place, None), None)
             camera, sigma = place
             picture = self._read(frame.path)
@@ -329,13 +308,13 @@ class Drawer(Background):
             raise
         except OrthoSwarmError as error:
             reason = str(error).replace(frame.path.name, frame.image)  # as its sender calls it, not the store
-            self._events.publish(PictureRejected(frame, reason, False))
+            self._events.publish(happened.PictureRejected(frame, reason, False))
             return self._report(pending, Drawn(pending.seq, reason, None), None)
         except (ValueError, ArithmeticError) as error:
             return self._report(pending, Drawn(pending.seq, f"it cannot be drawn ({error})", None), None)
         quality = _quality(picture)
         if added.reason is None:
-            self._events.publish(PictureDrawn(PlacedFrame(frame, camera, "realtime", sigma), quality))
+            self._events.publish(happened.PictureDrawn(PlacedFrame(frame, camera, "realtime", sigma), quality))
         by = "receiver" if pose is None else "map"
         document = None if added.reason else self._document(pending, camera, level, sigma, by)
         small = thumbnail(picture).tobytes()
@@ -358,29 +337,12 @@ class Drawer(Background):
             corners = camera.corners()
             if np.isfinite(corners).all():
                 outline = [[float(lon), float(lat)] for lat, lon in grid.to_geographic(corners)]
-        self._events.publish(FrameReported(
-            seq=drawn.seq, vehicle=frame.vehicle, image=frame.image, sortie=pending.sortie,
+        self._events.tell(
+            "frame", seq=drawn.seq, vehicle=frame.vehicle, image=frame.image, sortie=pending.sortie,
             stage="rejected" if drawn.reason else "realtime", reason=drawn.reason, sigma_m=drawn.sigma_m,
             lat_deg=fix.lat_deg, lon_deg=fix.lon_deg, outline=outline,
-        ))  # fmt: skip
+        )  # fmt: skip
         return drawn
-
-
-def load_kernels(folder: Path) -> None:
-    """Load the compiled kernels before the first picture needs them; draws for a moment in a folder."""
-    path = folder / new_name("warm")
-    try:
-        lens = Lens(32, 24, 30.0)
-        camera = Camera(np.array([16.0, 16.0, 30.0]), rotation_from_angles(0.0, NADIR_PITCH_RAD, 0.0), lens)
-        with Canvas.create(
-            path, GroundGrid(epsg=32631, west=0.0, north=64.0, gsd_m=1.0, width=64, height=64), tile_px=64
-        ) as canvas:
-            RealtimeMosaic(canvas).add(np.full((24, 32, 4), 255, np.uint8), camera)
-        picture_quality(np.zeros((24, 32, 4), np.uint8))
-    except OrthoSwarmError as error:  # a full disk is told when there is something to draw
-        _log.warning("%s", error)
-    finally:
-        shutil.rmtree(path, ignore_errors=True)
 
 
 def _quality(picture: Bytes) -> PictureQuality | None:

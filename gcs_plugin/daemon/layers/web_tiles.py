@@ -20,12 +20,11 @@ from pyproj import Transformer
 
 from gcs_plugin.daemon.layers.layers import MapLayer
 from gcs_plugin.daemon.store.daemon_events import AreaChanged
-from gcs_plugin.daemon.store.workspace_lock import open_basemap
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.earth import WEB_MERCATOR_M
-from orthoswarm.model.errors import OrthoSwarmError
-from orthoswarm.model.geo import GroundGrid
+from orthoswarm.model.errors import InputError, OrthoSwarmError
+from orthoswarm.model.geo import GroundGrid, area_epsg
 from orthoswarm.raster.basemap import Basemap
 
 Bytes = NDArray[np.uint8]
@@ -245,3 +244,27 @@ class TileServer:
             newest = canvas.newest(box) if box is not None else 0
             # an unchanged tile keeps its version through generations on one grid; another grid begins to count anew
             return f"{canvas.grid}/{newest}" if newest else "empty"
+
+
+def open_basemap(path: Path) -> Basemap | None:
+    """The basemap on the UTM grid of its own centre, for display before there is an area; None if that is unknown.
+
+    Raises:
+        InputError: it cannot be read, or lies nowhere.
+    """
+    import rasterio
+    from rasterio.errors import RasterioError
+    from rasterio.warp import transform_bounds
+
+    if path.is_dir():
+        return None
+    try:
+        with rasterio.open(path) as raster:
+            if raster.crs is None:
+                raise InputError(f"the basemap {path.name} has no coordinate system; give a georeferenced map")
+            west, south, east, north = transform_bounds(raster.crs, 4326, *raster.bounds)
+    except RasterioError as error:
+        raise InputError(f"the basemap {path.name} cannot be read ({error}); check the file") from None
+    basemap = Basemap.open(path, area_epsg([south, north], [west, east]))
+    basemap.require_readable(basemap.bounds)  # check it now, not when the first vehicle completes
+    return basemap

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from datetime import datetime
 from typing import Any, Final, TypedDict, cast
 
-from gcs_plugin.daemon.store.daemon_events import Events, FindsChanged, PlanChanged
+from gcs_plugin.daemon.store.daemon_events import Events
 from gcs_plugin.daemon.store.journal import Journal
 from orthoswarm.export.product_files import iso_time
 from orthoswarm.model.errors import InputError, OrthoSwarmError
@@ -66,7 +66,7 @@ class ConsoleState:
                 raise OutdatedError(f"the plan was changed elsewhere (version {before}); load it and change it again")
             plan = {key: body.get(key) for key in _PLAN_FIELDS} | {"version": before + 1}
             self._journal.remember("console_plan", plan)
-        self._events.publish(PlanChanged(plan))
+        self._events.tell("plan", **plan)
         return plan
 
     def finds(self) -> list[FindRow]:
@@ -78,11 +78,7 @@ class ConsoleState:
         return found
 
     def add_find(self, body: Mapping[str, Any]) -> FindRow:
-        """Add a find; returns it with its id.
-
-        Raises:
-            InputError: a field is invalid, or there are too many finds.
-        """
+        """Add a find; returns it with its id; raises InputError: a field is invalid, or there are too many finds."""
         row = _find(body)
         row["time"], row["version"] = _time_of(body), 1
         with self._lock:
@@ -91,7 +87,7 @@ class ConsoleState:
                 raise InputError(f"there are {_MOST_FINDS} finds; delete some first")
             row = {"id": found["next"], **row}
             self._journal.remember("finds", {"next": found["next"] + 1, "rows": [*found["rows"], row]})
-        self._events.publish(FindsChanged())
+        self._events.tell("finds")
         return row
 
     def change_find(self, number: int, body: Mapping[str, Any]) -> FindRow | None:
@@ -119,7 +115,7 @@ class ConsoleState:
             row["version"] = before["version"] + 1
             changed = [row if old is before else old for old in rows]
             self._journal.remember("finds", self._finds() | {"rows": changed})
-        self._events.publish(FindsChanged())
+        self._events.tell("finds")
         return row
 
     def delete_find(self, number: int) -> bool:
@@ -130,16 +126,12 @@ class ConsoleState:
             if len(rows) == len(found["rows"]):
                 return False
             self._journal.remember("finds", found | {"rows": rows})
-        self._events.publish(FindsChanged())
+        self._events.tell("finds")
         return True
 
 
 def _find(body: Mapping[str, Any]) -> FindRow:
-    """Place and note of a find.
-
-    Raises:
-        InputError: a field is invalid.
-    """
+    """Place and note of a find; raises InputError: a field is invalid."""
     note = body.get("note") or ""
     if not isinstance(note, str) or len(note) > _MOST_NOTE:
         raise InputError(f"note is not a text of at most {_MOST_NOTE} characters; send a shorter one")

@@ -1,8 +1,9 @@
 """What has happened, as the daemon's parts tell each other and the pages.
 
 An event with a `page` name goes to the open pages as well, as JSON: `type` and its `values`, which pages and other
-programs rely on. Which part hears which event stands in one table, in `gcs_plugin.daemon.daemon`. The one bus,
-`Events`, hands them over in the publisher's thread; a page that is slow does not hold anyone up.
+programs rely on; what pages alone are told is a `Told`. Which part hears which event stands in one table, in
+`gcs_plugin.daemon.daemon`. The one bus, `Events`, hands them over in the publisher's thread; a page that is slow does
+not hold anyone up.
 """
 
 import asyncio
@@ -11,8 +12,8 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
-from typing import Any, ClassVar, Final, TypeVar
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar, Final, Literal, TypeVar
 
 from gcs_plugin.daemon.store.job_rows import Job
 from orthoswarm.model.frame import Frame
@@ -29,9 +30,6 @@ class Event:
     def values(self) -> Mapping[str, Any]:
         """What pages are told of it, as JSON values."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
-
-
-# -- pictures and the map in flight -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,9 +123,6 @@ class CardRead(Event):
     vehicle: str
 
 
-# -- missions and jobs ------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, slots=True)
 class MissionNoted(Event):
     """What a vehicle's mission came to is in the journal, with the refinement that it asks for; `kind`: see there."""
@@ -143,185 +138,36 @@ class JobEnded(Event):
     job: Job
 
 
-# -- what pages are told, too -----------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Note(Event):
-    """A sentence for the operator."""
-
-    page = "note"
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
-class Problem(Event):
-    """What cannot be written or drawn at present."""
-
-    page = "problem"
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
-class Overload(Event):
-    """How many pictures are put off, and in words."""
-
-    page = "overload"
-    put_off: int
-    text: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FrameReported(Event):
-    """A picture was drawn or rejected; `outline`: its corners, longitude and latitude."""
-
-    page = "frame"
-    seq: int
-    vehicle: str
-    image: str
-    sortie: int
-    stage: str
-    reason: str | None
-    sigma_m: float | None
-    lat_deg: float
-    lon_deg: float
-    outline: list[list[float]] | None
-
-
-@dataclass(frozen=True, slots=True)
-class LayerDrawn(Event):
-    """Pixels of the real-time layer have changed."""
-
-    page = "layer"
-    layer: str
-    version: int
-
-
 @dataclass(frozen=True, slots=True)
 class LayerPublished(Event):
     """A sortie is on the next generation of a refined layer, which has replaced the one before."""
 
-    page = "layer"
+    page: ClassVar[str] = "layer"
     layer: str
     version: int
     vehicle: str | None
     sortie: int | None
 
 
-@dataclass(frozen=True, slots=True)
-class RequestsChanged(Event):
-    """A request for a picture on a vehicle has another state."""
-
-    page = "requests"
-
-
-@dataclass(frozen=True, slots=True)
-class FindsChanged(Event):
-    """A find was marked, changed or deleted."""
-
-    page = "finds"
+PageKind = Literal[
+    "command", "completion", "coverage", "finds", "frame", "holds", "job", "layer", "log", "note", "overload", "people",
+    "plan", "problem", "refused", "requests", "traffic", "vehicle", "vehicle_event",
+]  # fmt: skip
+"""What pages alone are told: outcomes of commands and of refinements after completions, gaps, finds, pictures as they
+are drawn or refused, who has which vehicle, jobs, pixels of the real-time layer, sentences for the operator, other
+aircraft, changed values of a vehicle's row, and events of the fleet."""
 
 
 @dataclass(frozen=True, slots=True)
-class PictureRefused(Event):
-    """A picture was refused, dropped or left off the map."""
+class Told(Event):
+    """Something that no part of the daemon acts on, for pages."""
 
-    page = "refused"
-    cause: str
-    count: int
-    vehicle: str
-    image: str
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class TrafficChanged(Event):
-    """Other aircraft."""
-
-    page = "traffic"
-    rows: list[dict[str, Any]]
-
-
-@dataclass(frozen=True, slots=True)
-class _RowEvent(Event):
-    """An event whose values are those of a row."""
-
-    row: Mapping[str, Any]
+    page: PageKind = "note"  # type: ignore[misc]
+    told: Mapping[str, Any] = field(default_factory=dict)
 
     def values(self) -> Mapping[str, Any]:
-        """The row."""
-        return self.row
-
-
-@dataclass(frozen=True, slots=True)
-class VehicleChanged(_RowEvent):
-    """Changed values of a vehicle's row."""
-
-    page = "vehicle"
-
-
-@dataclass(frozen=True, slots=True)
-class VehicleReported(_RowEvent):
-    """An event of the fleet, in words."""
-
-    page = "vehicle_event"
-
-
-@dataclass(frozen=True, slots=True)
-class CommandDone(_RowEvent):
-    """The outcome of a command to a vehicle."""
-
-    page = "command"
-
-
-@dataclass(frozen=True, slots=True)
-class PlanChanged(_RowEvent):
-    """The operator's plan."""
-
-    page = "plan"
-
-
-@dataclass(frozen=True, slots=True)
-class PeopleChanged(Event):
-    """Somebody was invited, has joined or was revoked."""
-
-    page = "people"
-
-
-@dataclass(frozen=True, slots=True)
-class LogGrew(Event):
-    """Somebody has done something."""
-
-    page = "log"
-
-
-@dataclass(frozen=True, slots=True)
-class HoldsChanged(Event):
-    """Who has which vehicle; `rows`: see `Pilots.rows`."""
-
-    page = "holds"
-    rows: list[dict[str, Any]]
-
-
-@dataclass(frozen=True, slots=True)
-class CoverageChanged(_RowEvent):
-    """Gaps were looked for again: their number, the shares, and the version of /api/coverage."""
-
-    page = "coverage"
-
-
-@dataclass(frozen=True, slots=True)
-class JobChanged(_RowEvent):
-    """A job's state or progress."""
-
-    page = "job"
-
-
-@dataclass(frozen=True, slots=True)
-class CompletionRefined(_RowEvent):
-    """What the refinement after a completion came to."""
-
-    page = "completion"
+        """What they are told, as JSON values."""
+        return self.told
 
 
 Happened = TypeVar("Happened", bound=Event)
@@ -386,10 +232,14 @@ class Events:
         for handler in self._handlers.get(type(event), ()):
             handler(event)
 
+    def tell(self, page: PageKind, /, **values: Any) -> None:
+        """Tell pages something, as JSON values; any thread."""
+        self.publish(Told(page, values))
+
     def say(self, text: str) -> None:
-        """Tell the operator something, in the log too."""
+        """Tell the operator a sentence, in the log too."""
         _log.info("%s", text)
-        self.publish(Note(text))
+        self.tell("note", text=text)
 
     def subscribe(self) -> Subscription:
         """Start listening, in the running event loop; for a page."""

@@ -245,13 +245,6 @@ def fact_change(key: str, value: Any) -> Change:
     return statement("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, json.dumps(value)))
 
 
-def workspace_opened(boot: str, *, trusted: bool) -> Change:
-    """The change at a daemon's start; what was drawn before is drawn again unless it can be trusted."""
-    facts = fact_change("boot", boot), fact_change("clean", False)
-    drawn = () if trusted else (drawn_forgotten, statement("DELETE FROM meta WHERE key = 'realtime'", ()))
-    return all_changes(*facts, *drawn)
-
-
 def drawn_forgotten(db: sqlite3.Connection) -> None:
     """The change after which all frames are drawn again."""
     db.execute("UPDATE frames SET drawn = 0")

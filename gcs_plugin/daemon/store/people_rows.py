@@ -1,7 +1,8 @@
-"""The people of a command post: invitations, sessions and roles, and the log of who did what when.
+"""The people of a command post: invitations, sessions and roles, who has which vehicle, and who did what when.
 
 A secret (of an invitation, of a session) is given out once; the journal has its hash alone. Secrets are random, so one
-round of SHA-256 hides them.
+round of SHA-256 hides them. Who has which vehicle is kept in memory: who commands a free one has it, until it is handed
+over, freed, or its pilot is gone; after a restart vehicles are free.
 """
 
 import csv
@@ -12,17 +13,17 @@ import secrets
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Final, NamedTuple
 
-from gcs_plugin.daemon.store.daemon_events import Events, LogGrew, PeopleChanged
+from gcs_plugin.daemon.store.daemon_events import Events
 from gcs_plugin.daemon.store.journal import Journal, packed, unpacked
 from orthoswarm.export.product_files import iso_time
 from orthoswarm.export.tactical.places import spreadsheet_cell
-from orthoswarm.model.errors import InputError
+from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 _INVITED_S: Final = 24 * 3600.0  # an invitation that nobody has opened by then is void: it may lie in a chat for ever
 _MOST_NAME: Final = 60  # characters
@@ -117,7 +118,7 @@ class People:
             number = self._journal.write(
                 lambda db: db.execute("INSERT INTO people (name, role, invitation, made) VALUES (?, ?, ?, ?)", values)
             ).lastrowid
-        self._events.publish(PeopleChanged())
+        self._events.tell("people")
         return int(number or 0), secret
 
     def join(self, invitation: object) -> tuple[Person, str] | None:
@@ -131,7 +132,7 @@ class People:
             self._read()
         if row is None:
             return None
-        self._events.publish(PeopleChanged())
+        self._events.tell("people")
         return self._known[row["id"]], secret
 
     def revoke(self, number: int) -> bool:
@@ -143,7 +144,7 @@ class People:
             change = "UPDATE people SET revoked = ? WHERE id = ? AND revoked IS NULL"
             done = self._journal.write(lambda db: db.execute(change, values)).rowcount > 0
             self._read()
-        self._events.publish(PeopleChanged())
+        self._events.tell("people")
         return done
 
     def rows(self) -> list[dict[str, Any]]:
@@ -200,7 +201,7 @@ class People:
     def _noted(self, future: "Future[None]") -> None:
         if (problem := future.exception()) is not None:
             _log.warning("who did what was not noted: %s", problem)
-        self._events.publish(LogGrew())
+        self._events.tell("log")
 
     def log(self, most: int | None = _LATEST) -> list[dict[str, Any]]:
         """The log as JSON values, newest first: `time`, `name`, `role`, `action`, `target`, `outcome`, `reason`."""
@@ -239,3 +240,107 @@ UPDATE deeds SET time = ?, count = count + 1 WHERE id = (SELECT max(id) FROM dee
 
 def _hash(secret: str) -> bytes:
     return hashlib.sha256(secret.encode("utf-8", "surrogatepass")).digest()
+
+
+GONE_S: Final = 20.0
+"""A pilot whose page was not heard for so long has nothing any more: page reloads and short losses of the Wi-Fi take
+less, and RTL, pause and land are open to everybody meanwhile."""
+
+
+@dataclass(slots=True)
+class _Hold:
+    """A vehicle's pilot, and who has asked for it."""
+
+    pilot: Person
+    asked: Person | None = None
+
+
+class Pilots:
+    """Who has which vehicle; `people`: knows who is here. `events`: tells pages."""
+
+    def __init__(self, people: People, events: Events) -> None:
+        self._people, self._events = people, events
+        self._lock = threading.Lock()
+        self._holds: dict[str, _Hold] = {}
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Vehicles with a pilot who is here, as JSON: `vehicle`, `pilot` and `asked` ({`id`, `name`} or null)."""
+        with self._lock:
+            held = {vehicle: self._held(vehicle) for vehicle in sorted(self._holds)}
+        return [
+            {"vehicle": vehicle, "pilot": _row(hold.pilot), "asked": _row(hold.asked)}
+            for vehicle, hold in held.items() if hold is not None
+        ]  # fmt: skip
+
+    def claim(self, person: Person, vehicles: Iterable[str], *, whole: bool = False) -> dict[str, str]:
+        """Let a pilot have the free ones of some vehicles; returns why not, for each that another has.
+
+        Args:
+            person: who commands them. vehicles: their ids. whole: take none if another has one.
+
+        Raises:
+            OrthoSwarmError: with `whole`, another pilot has one.
+        """
+        refused: dict[str, str] = {}
+        with self._lock:
+            before = dict(self._holds)
+            for vehicle in vehicles:
+                hold = self._held(vehicle)
+                if hold is None:
+                    self._holds[vehicle] = _Hold(person)
+                elif hold.pilot.id != person.id:
+                    refused[vehicle] = (
+                        f"{hold.pilot.name} has {vehicle}; ask for it; all pilots may pause, return and land it"
+                    )
+            if refused and whole:
+                self._holds = before
+                raise OrthoSwarmError("; ".join(refused.values()))
+            changed = before != self._holds
+        if changed:
+            self._tell()
+        return refused
+
+    def change(self, person: Person, vehicle: str, act: str) -> bool:
+        """`take` a vehicle, or ask its pilot for it; as its pilot `give` it to who asked, `keep` it, or `free` it.
+
+        Returns:
+            Whether the person has the vehicle now.
+
+        Raises:
+            InputError: there is no such act.
+            OrthoSwarmError: it is not this pilot's, or nobody has asked.
+        """
+        with self._lock:
+            hold = self._held(vehicle)
+            if act not in ("take", "give", "keep", "free"):
+                raise InputError("there is no such act; send take, give, keep or free")
+            if act == "take":
+                hold = self._holds[vehicle] = hold or _Hold(person)
+                hold.asked = hold.asked if hold.pilot.id == person.id else person
+            elif hold is None or hold.pilot.id != person.id:
+                raise OrthoSwarmError(f"you do not have {vehicle}; take it first")
+            elif act == "keep":
+                hold.asked = None
+            elif act == "free":
+                del self._holds[vehicle]
+            elif hold.asked is None or self._people.find(hold.asked.id) is None:
+                raise OrthoSwarmError(f"nobody asks for {vehicle} now; free it, and anybody can take it")
+            else:
+                self._holds[vehicle] = _Hold(hold.asked)
+            now = self._held(vehicle)
+        self._tell()
+        return now is not None and now.pilot.id == person.id
+
+    def _held(self, vehicle: str) -> _Hold | None:
+        """The hold of a vehicle whose pilot is here and may still command."""
+        hold = self._holds.get(vehicle)
+        if hold is None or self._people.find(hold.pilot.id) is None:
+            return None
+        return hold if self._people.is_here(hold.pilot.id, GONE_S) else None
+
+    def _tell(self) -> None:
+        self._events.tell("holds", rows=self.rows())
+
+
+def _row(person: Person | None) -> dict[str, Any] | None:
+    return None if person is None else {"id": person.id, "name": person.name}

@@ -16,7 +16,7 @@ from typing import Final
 
 from gcs_plugin.daemon.store.frame_rows import Whose
 from orthoswarm.export.atomic_file import atomic_write, disk_error
-from orthoswarm.model.errors import InputError
+from orthoswarm.model.errors import DiskFullError, InputError, StorageError
 from orthoswarm.model.frame import Frame
 from orthoswarm.raster import kept_ranges, picture_file
 from orthoswarm.raster.grey_pictures import stored_bytes
@@ -26,6 +26,7 @@ MOST_PICTURE_BYTES: Final = 96_000_000
 _SUFFIXES: Final = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "WEBP": ".webp", "TIFF": ".tif", "BMP": ".bmp"}
 _FORMATS: Final = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # a JPEG with several pictures opens as MPO
 _FREE_MB: Final = 1000.0
+_JOURNAL_MB: Final = 50.0
 
 
 def frame_key(vehicle: str, image: str) -> bytes:
@@ -87,6 +88,19 @@ class PictureStore:
             if ranges is not None:
                 with atomic_write(self.folder / kept_ranges.FILE) as part:
                     part.write_text(json.dumps(ranges), encoding="ascii")
+
+    def require_space(self, size: int) -> None:
+        """Refuse to fill the disk, while there is still room for the journal.
+
+        Raises:
+            StorageError: there is too little room.
+        """
+        try:
+            free = shutil.disk_usage(self.folder).free
+        except OSError as error:
+            raise StorageError(f"the workspace cannot be reached ({error.strerror}); connect its disk") from None
+        if free < _JOURNAL_MB * 1e6 + size:
+            raise DiskFullError(f"the disk is nearly full ({free / 1e6:.0f} MB left); free some space")
 
     def put(self, key: bytes, suffix: str, data: bytes) -> str:
         """Write a picture; when this returns, neither a crash nor a power cut loses it.

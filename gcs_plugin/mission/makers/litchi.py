@@ -28,11 +28,7 @@ def is_litchi(text: str) -> bool:
 
 
 def litchi_text(route: DroneRoute) -> str:
-    """The CSV of a route.
-
-    Raises:
-        InputError: it has more waypoints than Litchi takes.
-    """
+    """The CSV of a route; raises InputError: it has more waypoints than Litchi takes."""
     if len(route.points) > MOST_POINTS:
         raise InputError(f"Litchi takes {MOST_POINTS} waypoints, not {len(route.points)}; give a shorter --endurance")
     text = io.StringIO()

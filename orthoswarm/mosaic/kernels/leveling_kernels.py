@@ -23,56 +23,94 @@ def _slot(labels, wanted):  # type: ignore[no-untyped-def]
 
 
 @in_place_kernel
-def sum_colors(rgba, label, other_rgba, other, cell, dark, bright, labels, pixels, pairs, both):  # type: ignore[no-untyped-def]
-    """Count the pixels of a tile's pictures by cell, and sum the colours of two pictures at the same ground near seams.
+def count_pixels(packed, label, cell, labels, pixels):  # type: ignore[no-untyped-def]
+    """Count the pixels of a tile's pictures by cell.
 
     Args:
-        rgba: uint8 (T, T, 4); label: int32 (T, T), whose colours these are, 0 = none.
-        other_rgba: uint8 (T, T, 4) and other: int32 (T, T), the same of the other picture near seams.
-        cell: side of the cells, pixels. dark, bright: levels outside of which a colour is clipped.
-        labels: int32 (R, C, SLOTS), pixels: float32 (R, C, SLOTS); pairs: int32 (R, C, SLOTS, 2), the lesser label
-            first, both: float64 (R, C, SLOTS, BOTH): zeros, are filled.
+        packed: uint32 (T, T), colours; label: int32 (T, T), whose these are, 0 = none. cell: side of the cells, pixels.
+        labels: int32 (R, C, SLOTS), pixels: float32 (R, C, SLOTS): zeros, are filled.
     """
     for r in range(label.shape[0]):
         i = r // cell
         last, last_j, at = -1, -1, -1
         for c in range(label.shape[1]):
-            a, b, j = label[r, c], other[r, c], c // cell
-            if a == 0 or rgba[r, c, 3] == 0:
+            a, j = label[r, c], c // cell
+            if a == 0 or packed[r, c] >> np.uint32(24) == 0:
                 continue
             if a != last or j != last_j:
                 at = _slot(labels[i, j], a)
                 last, last_j = a, j
             if at >= 0:
                 pixels[i, j, at] += 1.0
-            if b == 0 or b == a or other_rgba[r, c, 3] == 0:
-                continue
-            _slot(labels[i, j], b)
-            clear = True
-            for channel in range(3):
-                clear = clear and dark < rgba[r, c, channel] < bright and dark < other_rgba[r, c, channel] < bright
-            if not clear:
-                continue
-            less, more = min(a, b), max(a, b)
-            for k in range(SLOTS):
-                if pairs[i, j, k, 0] == 0:
-                    pairs[i, j, k, 0], pairs[i, j, k, 1] = less, more
-                if pairs[i, j, k, 0] == less and pairs[i, j, k, 1] == more:
-                    swapped = a > b
-                    one, two = 0.0, 0.0
-                    both[i, j, k, 0] += 1.0
-                    for channel in range(3):
-                        here, there = float(rgba[r, c, channel]), float(other_rgba[r, c, channel])
-                        if swapped:
-                            here, there = there, here
-                        both[i, j, k, 1 + channel] += here
-                        both[i, j, k, 4 + channel] += there
-                        one += here
-                        two += there
-                    log = np.log(one / two)
-                    both[i, j, k, 7] += log
-                    both[i, j, k, 8] += log * log
-                    break
+
+
+@kernel
+def sum_seams(packed, label, index, other, colors, cell, dark, bright, labels, pairs, both):  # type: ignore[no-untyped-def]
+    """Sum the colours of two pictures at the same ground near seams.
+
+    Args:
+        packed, label, cell, labels: see `count_pixels`. index, other, colors: of the other pictures, see
+            seam_pixels.SeamPixels. dark, bright: levels outside of which a colour is clipped.
+        pairs: int32 (R, C, SLOTS, 2), the lesser label first, both: float64 (R, C, SLOTS, BOTH): zeros, are filled.
+    """
+    flat, flat_label, side = packed.ravel(), label.ravel(), label.shape[1]
+    full = np.uint32(255)
+    for n in range(len(index)):
+        p = index[n]
+        a, b, here, there = flat_label[p], other[n], flat[p], colors[0, n]
+        if a == 0 or b == a or here >> np.uint32(24) == 0 or there >> np.uint32(24) == 0:
+            continue
+        i, j = p // side // cell, p % side // cell
+        _slot(labels[i, j], b)
+        if a > b:
+            a, b, here, there = b, a, there, here
+        clear = True
+        for channel in range(3):
+            shift = np.uint32(8 * channel)
+            clear = clear and dark < (here >> shift) & full < bright and dark < (there >> shift) & full < bright
+        if not clear:
+            continue
+        for k in range(SLOTS):
+            if pairs[i, j, k, 0] == 0:
+                pairs[i, j, k, 0], pairs[i, j, k, 1] = a, b
+            if pairs[i, j, k, 0] == a and pairs[i, j, k, 1] == b:
+                one, two = 0.0, 0.0
+                both[i, j, k, 0] += 1.0
+                for channel in range(3):
+                    shift = np.uint32(8 * channel)
+                    first, second = float((here >> shift) & full), float((there >> shift) & full)
+                    both[i, j, k, 1 + channel] += first
+                    both[i, j, k, 4 + channel] += second
+                    one += first
+                    two += second
+                log = np.log(one / two)
+                both[i, j, k, 7] += log
+                both[i, j, k, 8] += log * log
+                break
+
+
+@kernel
+def level_listed(colors, index, other, side, cell, labels, factors):  # type: ignore[no-untyped-def]
+    """Multiply the colours of listed pixels (seam_pixels.SeamPixels) of a tile by their pictures' factors.
+
+    Args:
+        colors: uint32 (1, N), changed in place. index, other: int32 (N,). side: of the tile, pixels.
+        cell, labels, factors: see `apply_factors`.
+    """
+    corner, has, total = np.ones((2, 2, 3), np.float32), np.zeros((2, 2), np.bool_), np.ones(3, np.float32)
+    for n in range(len(index)):
+        y, x = (index[n] // side + 0.5) / cell + 0.5, (index[n] % side + 0.5) / cell + 0.5
+        i, j = int(y), int(x)
+        fy, fx = np.float32(y - i), np.float32(x - j)
+        _corners(labels, factors, i, j, other[n], corner, total, has)
+        levelled = colors[0, n] & np.uint32(0xFF000000)
+        for channel in range(3):
+            west = corner[0, 0, channel] + fy * (corner[1, 0, channel] - corner[0, 0, channel])
+            east = corner[0, 1, channel] + fy * (corner[1, 1, channel] - corner[0, 1, channel])
+            shift = np.uint32(8 * channel)
+            value = np.float32((colors[0, n] >> shift) & np.uint32(255)) * (west + fx * (east - west))
+            levelled |= np.uint32(min(value + np.float32(0.5), np.float32(255.0))) << shift
+        colors[0, n] = levelled
 
 
 @kernel

@@ -13,7 +13,7 @@ import numpy as np
 from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.model.arrays import Array, Indices
 from orthoswarm.mosaic.kernels.lens_arrays import K1, K2, K3, F, U, V
-from orthoswarm.mosaic.kernels.render_arrays import LATTICE_PX
+from orthoswarm.mosaic.kernels.render_arrays import LATTICE_PX, lattice_height
 
 UNIT = 128  # sum of the weights, and number of steps of a fraction of a pixel
 BEFORE, AFTER = 1, 2
@@ -138,6 +138,22 @@ def _columns_of(rows, chosen):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _shown(index, at, position, rotation, lens, gsd, size, shrink):  # type: ignore[no-untyped-def]
+    """Where pixels (column, row, height) lie in a picture, of those that it shows; see `place`."""
+    count = len(index)
+    spots, sights = np.empty((2, count), np.int32), np.empty((3, count), np.float32)
+    shown = _project(count, at, position, rotation, lens, gsd, size, shrink, spots, sights)
+    if shown < count:  # beside a seam, at the picture's very border
+        visible = sights[2] > 0.0
+        index, spots, sights = index[visible], _columns_of(spots, visible), _columns_of(sights, visible)
+    box = np.zeros(4, np.int32)
+    if shown > 0:
+        box[0], box[1] = _range(spots[0])
+        box[2], box[3] = _range(spots[1])
+    return index, spots, sights, box
+
+
+@kernel
 def place(label, mark, window, position, rotation, lens, lattice, gsd, size, factor):  # type: ignore[no-untyped-def]
     """Find a tile's pixels of one label in a picture, by the projection of render_arrays.
 
@@ -157,37 +173,51 @@ def place(label, mark, window, position, rotation, lens, lattice, gsd, size, fac
         labels = label[r, window[2] : window[3]]
         for c in range(labels.shape[0]):
             owned += np.uint64(labels[c] == mark)
-    index, spots, sights = np.empty(owned, np.int32), np.empty((2, owned), np.int32), np.empty((3, owned), np.float32)
-    at = np.empty((3, owned))
+    index, at = np.empty(owned, np.int32), np.empty((3, owned))
     _owned(label, mark, window, lattice, index, at)
-    shown = _project(owned, at, position, rotation, lens, gsd, size, 1.0 / factor, spots, sights)
-    if shown < owned:  # beside a seam, at the picture's very border
-        visible = sights[2] > 0.0
-        index, spots, sights = index[visible], _columns_of(spots, visible), _columns_of(sights, visible)
-    box = np.zeros(4, np.int32)
-    if shown > 0:
-        box[0], box[1] = _range(spots[0])
-        box[2], box[3] = _range(spots[1])
-    return index, spots, sights, box
+    return _shown(index, at, position, rotation, lens, gsd, size, 1.0 / factor)
+
+
+@kernel
+def place_listed(index, side, position, rotation, lens, lattice, gsd, size, factor):  # type: ignore[no-untyped-def]
+    """Find some pixels of a tile in a picture: their numbers in the list, and the rest as of `place`.
+
+    index: int32 (N,), their numbers in the tile. side: of the tile, pixels. The rest: see `place`.
+    """
+    at = np.empty((3, len(index)))
+    for n in range(len(index)):
+        row, column = index[n] // side, index[n] % side
+        at[0, n], at[1, n], at[2, n] = column, row, lattice_height(lattice, row, column)
+    numbers = np.arange(len(index)).astype(np.int32)
+    return _shown(numbers, at, position, rotation, lens, gsd, size, 1.0 / factor)
+
+
+SPOT_PX = 2  # pixels of a picture along each side that count as one part
+_SPOT_BITS = (UNIT * SPOT_PX).bit_length() - 1
 
 
 @in_place_kernel
-def drawn_again(index, spots, side, corner, spot_px, far_px, low, first):  # type: ignore[no-untyped-def]
+def drawn_again(index, spots, side, corner, far_px, low, first):  # type: ignore[no-untyped-def]
     """How many pixels show a part of a picture that is drawn elsewhere already.
 
     Args:
-        index, spots: of the pixels, see `place`. side: of the tile, pixels. corner: int32 (2,), its first row, column.
-        spot_px: pixels of the picture along each side of a part. far_px: pixels of the map from which on two places
-        count as two. low: int32 (2,), row and column of the least part.
+        index, spots: of the pixels, see `place`, in ascending order. side: of the tile, pixels.
+        corner: int32 (2,), its first row, column. far_px: pixels of the map from which on two places count as two.
+        low: int32 (2,), row and column of the least part, of SPOT_PX.
         first: int32 (rows, columns, 2), row and column where a part was drawn first, -1 where it was not; changed.
     """
     again = 0
+    us, vs = spots[0], spots[1]
+    row, start = np.int64(corner[0]), np.int64(0)
     for n in range(index.shape[0]):
-        i, j = spots[1, n] // UNIT // spot_px - low[0], spots[0, n] // UNIT // spot_px - low[1]
-        row, column = corner[0] + index[n] // side, corner[1] + index[n] % side
-        if first[i, j, 0] < 0:
-            first[i, j, 0], first[i, j, 1] = row, column
-        elif max(abs(first[i, j, 0] - row), abs(first[i, j, 1] - column)) > far_px:
+        while index[n] >= start + side:  # a division costs more than all the rest
+            start += side
+            row += 1
+        at = first[(vs[n] >> _SPOT_BITS) - low[0], (us[n] >> _SPOT_BITS) - low[1]]
+        column = corner[1] + index[n] - start
+        if at[0] < 0:
+            at[0], at[1] = row, column
+        elif max(abs(at[0] - row), abs(at[1] - column)) > far_px:
             again += 1
     return again
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from orthoswarm.canvas.tile_store import Key, TileStore
-from orthoswarm.compute.jit import in_place_kernel
+from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.model.arrays import Floats, Ints
 
 
@@ -73,21 +73,23 @@ def _transition(around, near, offsets, distance, border, other, share):  # type:
                     break
 
 
-@in_place_kernel
-def mix(rgba, labels, second, other, share):  # type: ignore[no-untyped-def]
+@kernel
+def mix(packed, index, share, colors):  # type: ignore[no-untyped-def]
     """Mix into a tile's colours those of the other pictures near seams.
 
     Args:
-        rgba: uint8 (T, T, 4), changed in place.
-        labels: int32 (T, T), whose colours `second` holds. second: uint8 (T, T, 4), alpha 0 where there is none.
-        other: int32 (T, T), which ones are wanted. share: float32 (T, T), and how much of them.
+        packed: uint32 (T, T), changed in place.
+        index, share, colors: see `seam_pixels.SeamPixels`.
     """
-    for r in range(rgba.shape[0]):
-        for c in range(rgba.shape[1]):
-            if other[r, c] == 0 or labels[r, c] != other[r, c] or second[r, c, 3] == 0 or rgba[r, c, 3] == 0:
-                continue
-            for channel in range(3):
-                own = np.float32(rgba[r, c, channel])
-                rgba[r, c, channel] = np.uint8(
-                    own + share[r, c] * (np.float32(second[r, c, channel]) - own) + np.float32(0.5)
-                )
+    flat, eight = packed.ravel(), np.uint32(8)
+    for n in range(len(index)):
+        own, other = flat[index[n]], colors[0, n]
+        if own >> np.uint32(24) == 0 or other >> np.uint32(24) == 0:
+            continue
+        mixed = np.uint32(0xFF000000)
+        for channel in range(3):
+            shift = eight * np.uint32(channel)
+            here = np.float32((own >> shift) & np.uint32(255))
+            there = np.float32((other >> shift) & np.uint32(255))
+            mixed |= np.uint32(here + share[n] * (there - here) + np.float32(0.5)) << shift
+        flat[index[n]] = mixed

@@ -21,9 +21,18 @@ import numpy as np
 
 from orthoswarm.canvas.tile_store import Key, Tile
 from orthoswarm.model.arrays import Array, Flags, Floats, Indices, Ints
-from orthoswarm.mosaic.kernels.leveling_kernels import BOTH, SLOTS, apply_factors, laplacian, sum_colors
+from orthoswarm.mosaic.kernels.leveling_kernels import (
+    BOTH,
+    SLOTS,
+    apply_factors,
+    count_pixels,
+    laplacian,
+    level_listed,
+    sum_seams,
+)
 from orthoswarm.mosaic.overlap_colors import BRIGHT_LEVEL, DARK_LEVEL
 from orthoswarm.mosaic.radiometry import GREATEST_FACTOR, conjugate_gradients
+from orthoswarm.mosaic.seams.seam_pixels import SeamPixels
 
 _LEVEL_CELLS: Final = 32
 """Cells across a picture in which it is corrected, about 3 m of the ground at a height of 75 m (the factor of a lawn
@@ -73,7 +82,7 @@ class TileColors:
         place: int64 (M, 3), row and column of a cell of the whole map, and the label of a picture there.
         pixels: float32 (M,), how many it has there.
         seam: int64 (S, 4), row, column, and two labels, where two pictures meet.
-        both: float32 (S, 9), sums over the pixels that both show, see sum_colors.
+        both: float32 (S, 9), sums over the pixels that both show, see sum_seams.
     """
 
     place: Indices
@@ -82,13 +91,17 @@ class TileColors:
     both: Floats
 
 
-def tile_colors(key: Key, tile: Tile, other: Tile | None, cell_px: int) -> TileColors:
+def tile_colors(key: Key, tile: Tile, near: SeamPixels | None, cell_px: int) -> TileColors:
     """Sum what a tile, and the other pictures near its seams, if there are any, show."""
     side = len(tile.plane) // cell_px
     labels, pixels = np.zeros((side, side, SLOTS), np.int32), np.zeros((side, side, SLOTS), np.float32)
     pairs, both = np.zeros((side, side, SLOTS, 2), np.int32), np.zeros((side, side, SLOTS, BOTH))
-    second = (np.zeros_like(tile.rgba), np.zeros_like(tile.plane)) if other is None else (other.rgba, other.plane)
-    sum_colors(tile.rgba, tile.plane, *second, cell_px, DARK_LEVEL, BRIGHT_LEVEL, labels, pixels, pairs, both)
+    count_pixels(tile.packed, tile.plane, cell_px, labels, pixels)
+    if near is not None:
+        sum_seams(
+            tile.packed, tile.plane, near.index, near.label, near.colors, cell_px, DARK_LEVEL, BRIGHT_LEVEL, labels,
+            pairs, both,
+        )  # fmt: skip
     corner = np.array(key) * side
     cells = np.nonzero(labels)
     place = np.column_stack([np.stack(cells[:2], 1) + corner, labels[cells]]).astype(np.int64)
@@ -109,9 +122,12 @@ class TileFactors:
     labels: Ints
     factors: Floats
 
-    def apply(self, tile: Tile) -> None:
-        """Multiply a tile's colours."""
+    def apply(self, tile: Tile, near: SeamPixels | None) -> None:
+        """Multiply a tile's colours, and those near its seams."""
         apply_factors(tile.rgba, tile.plane, self.cell_px, self.labels, self.factors)
+        if near is not None:
+            side = len(tile.plane)
+            level_listed(near.colors, near.index, near.label, side, self.cell_px, self.labels, self.factors)
 
 
 class Leveling:

@@ -49,7 +49,9 @@ class PreviewFile:
         Raises:
             StorageError: if it cannot be written.
         """
-        size = RECORD.itemsize * len(images)
+        size = RECORD.itemsize * max(
+            len(images), 2
+        )  # a lone record would be contiguous, for which kernels have no code
         try:
             if not path.exists() or path.stat().st_size != size:
                 with path.open("wb") as file:

@@ -204,7 +204,7 @@ class Tracker:
             self._gray, self._half, gray, half, self._live.uv, predicted, np.linalg.inv(predicted), limits, guess,
             found, good,
         )  # fmt: skip
-        kept, expected = _gate(guess, found, good, *gray.shape, _FLOW_CHANCE_SHARE)
+        kept, expected = _gate(guess, found, good, gray.shape[0], gray.shape[1], _FLOW_CHANCE_SHARE)
         return _Flow(good, found, kept, expected)
 
     def _start(self, gray: Gray) -> None:
@@ -232,50 +232,33 @@ class Tracker:
             )
 
 
-@kernel
-def _gate(guess, found, ok, rows, cols, chance):  # type: ignore[no-untyped-def]
+def _gate(guess: Floats, found: Floats, ok: Flags, rows: int, cols: int, chance: float) -> tuple[int, int]:
     """Keep flow close to the median residual, which must itself be close to the prediction, in ok, in place.
 
     None is kept where no more agree than corners on different ground would by chance (binomial, 3 sigma). Returns how
     many are kept, and how many were expected inside the picture.
     """
-    expected, margin = 0, _FLOW_INSIDE_PX
-    for k in range(len(ok)):
-        u, v = guess[k, 0], guess[k, 1]
-        expected += u >= 0 and v >= 0 and u <= cols - 1 and v <= rows - 1
-        u, v = found[k, 0], found[k, 1]
-        ok[k] = ok[k] and u >= margin and v >= margin and u <= cols - 1 - margin and v <= rows - 1 - margin
+    last, margin = np.array([cols - 1, rows - 1]), _FLOW_INSIDE_PX
+    expected = int(((guess >= 0) & (guess <= last)).all(1).sum())
+    ok &= ((found >= margin) & (found <= last - margin)).all(1)
     kept = 0
     if ok.sum() >= _FLOW_LEAST:
-        residual = (found - guess)[ok]
-        u, v = np.median(residual[:, 0]), np.median(residual[:, 1])
-        if np.hypot(u, v) <= _FLOW_MEDIAN_LIMIT_PX:
-            for k in range(len(ok)):
-                ok[k] = ok[k] and np.hypot(found[k, 0] - guess[k, 0] - u, found[k, 1] - guess[k, 1] - v) < _FLOW_GATE_PX
-                kept += ok[k]
+        residual = found - guess
+        middle = np.median(residual[ok], axis=0)
+        if np.hypot(*middle) <= _FLOW_MEDIAN_LIMIT_PX:
+            ok &= np.hypot(*(residual - middle).T) < _FLOW_GATE_PX
+            kept = int(ok.sum())
     if kept <= chance * expected + 3.0 * np.sqrt(chance * (1.0 - chance) * expected):
         ok[:], kept = False, 0
     return kept, expected
 
 
-@kernel
-def _oldest_per_cell(uv, age, ident, cols, size):  # type: ignore[no-untyped-def]
+def _oldest_per_cell(uv: Floats, age: Indices, ident: Indices, cols: int, size: int) -> Flags:
     """The track of each cell that has been followed for longest, bool (K,)."""
-    across = cols // size + 1
-    keep = np.zeros(len(uv), np.bool_)
-    if not len(uv):
-        return keep
-    cell = np.empty(len(uv), np.int64)
-    for k in range(len(uv)):
-        cell[k] = np.int64(uv[k, 1] // size) * across + np.int64(uv[k, 0] // size)
-    best = np.full(cell.max() + 1, -1)
-    for k in range(len(uv)):
-        b = best[cell[k]]
-        if b < 0 or age[k] > age[b] or (age[k] == age[b] and ident[k] < ident[b]):
-            best[cell[k]] = k
-    for b in best:
-        if b >= 0:
-            keep[b] = True
+    cell = (uv[:, 1] // size).astype(np.int64) * (cols // size + 1) + (uv[:, 0] // size).astype(np.int64)
+    order = np.lexsort((ident, -age, cell))
+    keep = np.zeros(len(uv), bool)
+    keep[order[np.unique(cell[order], return_index=True)[1]]] = True
     return keep
 
 
@@ -361,17 +344,29 @@ def predicted_homography(before: Array, after: Array, height_m: float, step: Arr
 
 
 def follow(
-    count: int, read: Callable[[int], Gray], prediction: Callable[[int], Array | None], cell_px: int
-) -> tuple[Tracks, Array]:
+    count: int,
+    read: Callable[[int], Gray],
+    prediction: Callable[[int], Array | None],
+    cell_px: int,
+    hopeless: Callable[[Array], bool],
+) -> tuple[Tracks, Array] | None:
     """The tracks of corners through pictures 0 .. count - 1, and the share that survived into each, float64 (count,).
 
-    read: returns picture i at working scale. cell_px: see Tracker. prediction: 3x3 homography from picture i - 1 to i,
-    None where tracking starts afresh.
+    Args:
+        read: returns picture i at working scale.
+        prediction: 3x3 homography from picture i - 1 to i, None where tracking starts afresh.
+        cell_px: see Tracker.
+        hopeless: whether to give up, by the shares so far; the rest of them are 1.
+
+    Returns:
+        None if it was given up.
     """
     tracker = Tracker(cell_px=cell_px)
     survived = np.ones(count)
     for i in range(count):
         survived[i] = tracker.add(i, read(i), prediction(i))
+        if hopeless(survived):
+            return None
     return tracker.tracks(), survived
 
 

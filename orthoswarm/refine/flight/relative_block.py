@@ -1,6 +1,6 @@
 """The relative block of one vehicle with overlapping pictures: records, calibration, tracks, start values."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
@@ -175,12 +175,16 @@ def _follow(records: FlightRecords, leg: Ints, pictures: Pictures, fov_start: fl
     unknown = not records.has_height.any()
     if leads_one_way(records.position, leg) if unknown else not calibration.trusted_height:
         return None
-    tracks, survived = _track(replace(records, yaw=records.yaw + calibration.yaw_offset), pictures, calibration)
-    few = _FOLLOWED_TRACKS_FACTOR * len(records.position) ** 0.5
-    if np.median(survived[1:]) < _FOLLOWED_SURVIVAL or tracks.count < few:
+
+    def hopeless(survived: Array) -> bool:
+        broken = unknown and survived[1:].min() < _UNBROKEN_SURVIVAL
+        return bool(broken or np.median(survived[1:]) < _FOLLOWED_SURVIVAL)
+
+    turned = replace(records, yaw=records.yaw + calibration.yaw_offset)
+    found = _track(turned, pictures, calibration, hopeless)
+    if found is None or found[0].count < _FOLLOWED_TRACKS_FACTOR * len(records.position) ** 0.5:
         return None
-    if unknown and survived[1:].min() < _UNBROKEN_SURVIVAL:
-        return None
+    tracks, survived = found
     return Followed(
         calibration=calibration,
         tracks=tracks,
@@ -232,7 +236,9 @@ def _step_sigma(values: Array) -> Array:
     return np.asarray(mad_sigmas(step - np.median(step, axis=0)) / np.sqrt(2.0))
 
 
-def _track(records: FlightRecords, pictures: Pictures, calibration: Calibration) -> tuple[Tracks, Array]:
+def _track(
+    records: FlightRecords, pictures: Pictures, calibration: Calibration, hopeless: Callable[[Array], bool]
+) -> tuple[Tracks, Array] | None:
     rotation, steps = records.rotation(), records.steps()
     width, height = pictures.size
     f = calibration.focal_px
@@ -246,7 +252,8 @@ def _track(records: FlightRecords, pictures: Pictures, calibration: Calibration)
         return predicted_homography(rotation[i - 1], rotation[i], calibration.height_m, step, matrix)
 
     few = len(rotation) < FEW_PHOTOS
-    return follow(len(rotation), pictures.gray, prediction, cell_px=CELL_PX // 2 if few else CELL_PX)
+    cell_px = CELL_PX // 2 if few else CELL_PX
+    return follow(len(rotation), pictures.gray, prediction, cell_px, hopeless)
 
 
 def _begin(records: FlightRecords, pictures: Pictures, calibration: Calibration, tracks: Tracks) -> Adjustment:

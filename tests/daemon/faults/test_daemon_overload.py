@@ -15,7 +15,7 @@ from gcs_plugin.daemon.layers.layers import MapLayer
 from gcs_plugin.daemon.layers.map_site import ExpectedPlace, MapSite
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.layers.web_tiles import TileServer
-from gcs_plugin.daemon.store.daemon_events import Events, FrameReported, Overload, PictureStored
+from gcs_plugin.daemon.store.daemon_events import Events, PictureStored
 from gcs_plugin.daemon.store.frame_rows import add_frame, undrawn_frames
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.picture_store import PictureStore, frame_key
@@ -172,7 +172,7 @@ def drawing(folder, read, **options):
     events, layer = RecordedEvents(), MapLayer("realtime")
     journal, store = Journal(folder / "journal.db"), PictureStore(folder / "p")
     (folder / "layers").mkdir()
-    expected = ExpectedPlace(TileServer({}), Plans(folder / "plans", None, None))
+    expected = ExpectedPlace(TileServer({}), Plans(folder / "plans", None, None).newest_bounds)
     site = MapSite(
         journal, layer, folder / "layers", gsd_m=0.5, fov_rad=None, expected=expected, events=events, memory_mb=64.0
     )
@@ -222,12 +222,12 @@ def test_a_jam_is_told_and_everything_is_drawn_in_the_end(tmp_path):
         may_read.release(100)
         wait_until(lambda: not undrawn_frames(journal, 1))
         rows = journal.rows("SELECT seq, drawn, reason FROM frames")
-    order = [event.seq for event in told if isinstance(event, FrameReported)]
+    order = [event.told["seq"] for event in told if event.page == "frame"]
     assert [(row["drawn"], row["reason"]) for row in rows] == [(1, None)] * 90
     assert sorted(order) == sorted(row["seq"] for row in rows)  # each once
     last_place = {seq for seq in order if (seq - min(order)) // 15 == 5}
     assert min(order.index(seq) for seq in last_place) < 60  # not after all that came before
-    assert any(isinstance(event, Overload) and event.put_off > 0 for event in told)
+    assert any(event.page == "overload" and event.told["put_off"] > 0 for event in told)
 
 
 def test_the_end_of_a_jam_is_told_though_nothing_comes_after_it(tmp_path):
@@ -243,5 +243,5 @@ def test_the_end_of_a_jam_is_told_though_nothing_comes_after_it(tmp_path):
         all_came.set()
         wait_until(lambda: not undrawn_frames(journal, 1))
         wait_until(lambda: not drawer.overload)
-    put_off = [event.put_off for event in told if isinstance(event, Overload)]
+    put_off = [event.told["put_off"] for event in told if event.page == "overload"]
     assert put_off[0] > 0 == put_off[-1]

@@ -15,11 +15,12 @@ from tests.kit.vehicles.sim_cameras import Cameras, square
 
 
 @pytest.fixture
-def flown(tmp_path):
+def flown(request, tmp_path):
+    """A daemon whose two vehicles fly six times as fast as real ones unless said otherwise."""
     lat, lon = (float(v) for v in GRID.to_geographic([EAST, NORTH]))
     cameras = Cameras()
     vehicles = make_swarm(2, home=(lat, lon, 500.0), airframe=Airframe(climb_m_s=8.0), on_exposure=cameras.expose)
-    with SimSwarm(vehicles, "tcpin:127.0.0.1:0", speed=6.0) as swarm:
+    with SimSwarm(vehicles, "tcpin:127.0.0.1:0", speed=getattr(request, "param", 6.0)) as swarm:
         links = [text for address in swarm.addresses for text in ("--link", address)]
         with serving(tmp_path / "w", *links) as served:
             cameras.served = served
@@ -162,6 +163,7 @@ def test_commands_that_cannot_be_carried_out_say_why(flown):
     assert served.command("/api/plans", bad).status_code == 422
 
 
+@pytest.mark.parametrize("flown", [12.0], indirect=True)
 def test_a_plan_is_started_at_its_times_once_all_hold_it(flown):
     served, _, _ = flown
     served.until("/api/vehicles", lambda rows: sum(r.get("lat_deg") is not None for r in rows) == 2)

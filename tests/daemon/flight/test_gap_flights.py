@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from gcs_plugin.daemon.flight_coverage.flown_legs import BatteryUse, FlownLegs, PlannedLegs
-from gcs_plugin.daemon.gap_flights import GapFlights
-from gcs_plugin.daemon.web_plans import Plans
+from gcs_plugin.daemon.flight_coverage.live_coverage import CoverageDocument, CoverageResult
+from gcs_plugin.daemon.web_plans import GapFlights, Plans
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.geo import LocalGrid
 from tests.daemon.on_links import OnLinks
@@ -111,13 +111,11 @@ class _Coverage:
     """Two gaps in the coverage of a plan."""
 
     def __init__(self, plan: str | None, no_fly: dict[str, Any] | None = None) -> None:
-        self.document = {"plan": plan}
         self.battery = BatteryUse()
         self.no_fly = no_fly
-        self.gaps = {
-            "type": "FeatureCollection",
-            "features": [self.square(0.0, 0.0, "not flown"), self.square(300.0, 200.0, "seen poorly")],
-        }
+        gaps = [self.square(0.0, 0.0, "not flown"), self.square(300.0, 200.0, "seen poorly")]
+        document, features = CoverageDocument(plan=plan), {"type": "FeatureCollection", "features": gaps}
+        self.result = CoverageResult(document, features, b"", [])
 
     @staticmethod
     def planning_fovs_deg(heights_over_level_ground: bool) -> dict[str, float]:

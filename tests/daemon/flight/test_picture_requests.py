@@ -6,10 +6,9 @@ import pytest
 from gcs_plugin.daemon.flight_coverage.picture_requests import PictureNames, PictureRequests, WantedPicture
 from gcs_plugin.links.file_transfer import FtpPayload, Nak, Opcode, file_crc32
 from gcs_plugin.links.mavlink import Autopilot
-from gcs_plugin.sim.file_server import FileServer
-from gcs_plugin.sim.lossy_radio import NO_FAULTS, Faults
-from gcs_plugin.sim.simulated_vehicle import SimVehicle
+from gcs_plugin.sim.simulated_swarm import NO_FAULTS, Faults
 from orthoswarm.model.errors import DiskFullError, InputError
+from tests.kit.vehicles.file_server import CardVehicle, FileServer
 from tests.kit.vehicles.memory_link import World
 
 START_S = 1_780_000_000.0
@@ -47,7 +46,7 @@ class Ground:
     def __init__(self, files=None, *, wanted=(3,), names=None, up=NO_FAULTS, down=NO_FAULTS, most=30_000.0, px4=True):
         kind = Autopilot.PX4 if px4 else Autopilot.ARDUPILOT
         self.server = None if files is None else FileServer(files=dict(files))
-        self.vehicle = SimVehicle(system=1, autopilot=kind, files=self.server)
+        self.vehicle = CardVehicle(self.server, system=1, autopilot=kind)
         self.world = World([self.vehicle], up, down)
         self.wanted = {number: WantedPicture("v1", number, START_S + number) for number in wanted}
         self.stored: dict[str, bytes] = {}

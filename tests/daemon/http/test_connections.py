@@ -13,7 +13,7 @@ from websockets.sync.client import connect
 
 from gcs_plugin.web.connections import ConnectionLimits, Connections, bounded_protocol
 
-_REQUEST_S = 1.0
+_REQUEST_S = 0.4
 _LIMIT_S = 60.0
 
 

@@ -4,12 +4,16 @@ import concurrent.futures
 import json
 import socket
 from dataclasses import replace
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
 import pytest
 
+from gcs_plugin.daemon import daemon
+from gcs_plugin.daemon.settings import Settings
+from orthoswarm.model.errors import InputError
 from tests.kit.daemon_kit import Shot, camera_at, form, jpeg, line, pose_of, serving, tile_over
 
 
@@ -258,13 +262,8 @@ def test_news_come_over_the_websocket(served):
         connect(address, origin="https://evil.example", open_timeout=120).recv(timeout=120)
 
 
-def test_a_second_daemon_does_not_take_a_living_ones_workspace(served, tmp_path):
-    from gcs_plugin.daemon.daemon import Daemon
-    from gcs_plugin.daemon.settings import Settings
-    from orthoswarm.model.errors import InputError
-
+def test_a_second_daemon_does_not_take_a_living_ones_workspace(served, monkeypatch):
+    monkeypatch.setattr(daemon, "_LOCK_S", 0.3)
     workspace = served.process.args[served.process.args.index("--workspace") + 1]
-    from pathlib import Path
-
     with pytest.raises(InputError, match="another run"):
-        Daemon(Settings(workspace=Path(workspace)))
+        daemon.Daemon(Settings(workspace=Path(workspace)))

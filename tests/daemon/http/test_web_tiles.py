@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from pyproj import Transformer
 from rasterio.transform import from_origin
 
-from gcs_plugin.daemon.jobs.kernel_warmup import made_up_ground, write_map
 from gcs_plugin.daemon.layers.layers import MapArea, MapLayer, successor
 from gcs_plugin.daemon.layers.web_tiles import (
     TileAddress,
@@ -16,16 +15,17 @@ from gcs_plugin.daemon.layers.web_tiles import (
     canvas_tile,
     encode,
     ground_patch,
+    open_basemap,
     over,
     resampled,
 )
-from gcs_plugin.daemon.store.workspace_lock import open_basemap
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.geo import GroundGrid, LocalGrid
 from orthoswarm.mosaic.realtime import RealtimeMosaic
 from tests.kit.daemon_kit import camera_at, tile_over
+from tests.kit.made_up_ground import made_up_ground, write_map
 from tests.kit.mosaic_scene import EAST, NORTH, colour, picture_of
 
 EPSG = 32648

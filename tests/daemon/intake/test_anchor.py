@@ -69,7 +69,7 @@ def test_a_map_that_was_begun_at_a_wrong_place_moves_once_while_pictures_are_dra
     (tmp_path / "layers").mkdir()
     site = MapSite(
         journal, MapLayer("realtime"), tmp_path / "layers", gsd_m=0.5, fov_rad=None, events=events, memory_mb=64.0,
-        expected=ExpectedPlace(TileServer({}), Plans(tmp_path / "plans", None, None)),
+        expected=ExpectedPlace(TileServer({}), Plans(tmp_path / "plans", None, None).newest_bounds),
     )  # fmt: skip
     frames = []
     for k, (lat, lon) in enumerate([(10.0, 10.0)] * 2 + [(48.0, 11.0)] * 3):

@@ -10,7 +10,7 @@ from gcs_plugin.daemon.flight_coverage.exposure_journal import EventRequests, Ex
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.fleet.separation.separation_watch import VehicleNames
 from gcs_plugin.links.mavlink import Autopilot, dialect
-from gcs_plugin.sim.lossy_radio import Faults
+from gcs_plugin.sim.simulated_swarm import Faults
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.geo import LocalGrid
 from tests.kit.vehicles.memory_link import World

@@ -16,10 +16,10 @@ from gcs_plugin.daemon.intake.picture_intake import VehicleIntake
 from gcs_plugin.daemon.intake.picture_sources import PictureSource
 from gcs_plugin.daemon.intake.posted_pose import frame_of
 from gcs_plugin.daemon.intake.watched_folder import is_complete, is_video_complete
-from gcs_plugin.daemon.store.daemon_events import Events, Note
+from gcs_plugin.daemon.store.daemon_events import Events, Told
 from gcs_plugin.daemon.store.picture_store import frame_key
 from gcs_plugin.links.mavlink import Autopilot, dialect
-from gcs_plugin.links.tlog_writer import TlogWriter, read_tlog, write_link_log
+from gcs_plugin.links.tlog_writer import TlogWriter, write_link_log
 from gcs_plugin.sim.multirotor import Airframe
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from telemetry import load
@@ -32,6 +32,7 @@ from tests.daemon.flight.test_daemon_flight import fly
 from tests.kit.daemon_kit import GRID, camera_at, jpeg, line, serving
 from tests.kit.mosaic_scene import EAST, NORTH
 from tests.kit.vehicles.sim_cameras import square
+from tests.kit.vehicles.telemetry_log import read_tlog
 
 av = pytest.importorskip("av")
 
@@ -93,7 +94,7 @@ class Workspace:
 def source_to(workspace, where, said, cache):
     """A vehicle's source of pictures; what it says is added to a list."""
     events = Events()
-    events.on(Note, lambda note: said.append(note.text))
+    events.on(Told, lambda note: said.append(note.told["text"]))
     log = cache / "telemetry.tlog"
     intake = VehicleIntake("v1", workspace, events, poses=LinkPoses(), tlog=log, system=None, cache=cache)
     return PictureSource(where, intake)

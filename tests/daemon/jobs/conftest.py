@@ -2,7 +2,7 @@
 
 import pytest
 
-from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
+from tests.kit.made_up_ground import made_up_flight, made_up_ground, write_map
 
 
 @pytest.fixture(scope="module")

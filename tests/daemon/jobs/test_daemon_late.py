@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gcs_plugin.daemon.daemon import Daemon
-from gcs_plugin.daemon.jobs.leg_watch import LegWatch
+from gcs_plugin.daemon.jobs.job_queue import LegWatch
 from gcs_plugin.daemon.jobs.publisher import LayerTurn, Publisher
 from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.settings import Settings

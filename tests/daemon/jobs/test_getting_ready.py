@@ -5,8 +5,8 @@ import time
 
 import pytest
 
-from gcs_plugin.daemon import getting_ready
 from gcs_plugin.daemon.daemon import Daemon
+from gcs_plugin.daemon.jobs import worker_pool
 from gcs_plugin.daemon.settings import Settings
 from tests.kit.made_up import LIMIT_S, after_job, complete, post
 
@@ -21,8 +21,8 @@ while not pathlib.Path(sys.argv[1]).exists():
 @pytest.fixture
 def compiled(tmp_path, monkeypatch):
     """The file at which the compiler ends."""
-    monkeypatch.setattr(getting_ready, "MADE_FOR", tmp_path / "not there")
-    monkeypatch.setattr(getting_ready, "_COMMAND", (sys.executable, "-c", _COMPILER, str(tmp_path / "compiled")))
+    monkeypatch.setattr(worker_pool, "MADE_FOR", tmp_path / "not there")
+    monkeypatch.setattr(worker_pool, "_COMMAND", (sys.executable, "-c", _COMPILER, str(tmp_path / "compiled")))
     return tmp_path / "compiled"
 
 

@@ -5,7 +5,6 @@ import pytest
 
 from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.jobs.job_queue import JobRequests, Jobs
-from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store.daemon_events import Events, JobEnded
@@ -13,6 +12,7 @@ from gcs_plugin.daemon.store.job_rows import Job
 from gcs_plugin.daemon.store.journal import Journal
 from tests.kit.daemon_kit import serving
 from tests.kit.made_up import after_job, complete, post
+from tests.kit.made_up_ground import made_up_flight, made_up_ground, write_map
 
 
 @pytest.mark.slow

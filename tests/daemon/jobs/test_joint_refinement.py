@@ -9,7 +9,6 @@ import pytest
 
 from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.jobs.job_queue import Jobs
-from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
 from gcs_plugin.daemon.jobs.neighbours import JointRefinement
 from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.solution_file import read_solution
@@ -23,6 +22,7 @@ from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
 from orthoswarm.model.placement import PlacedFrame, Solution
 from tests.kit.daemon_kit import StoppedWorkers
 from tests.kit.made_up import LIMIT_S, after_job, complete, post, truth
+from tests.kit.made_up_ground import made_up_flight, made_up_ground, write_map
 
 
 @pytest.fixture(scope="module")

@@ -11,10 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gcs_plugin.cli.main import main
-from gcs_plugin.daemon.jobs.job_queue import Jobs, Preempted
-from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
+from gcs_plugin.daemon.jobs.job_queue import Jobs, LegWatch, Preempted
 from gcs_plugin.daemon.jobs.leg_placement import MOST, newest_legs
-from gcs_plugin.daemon.jobs.leg_watch import LegWatch
 from gcs_plugin.daemon.jobs.publisher import detail_of
 from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
@@ -27,6 +25,7 @@ from orthoswarm.model.frame import Fix, Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.trajectory.legs import LEG_REACH, ended_legs
 from tests.kit.daemon_kit import Shot, StoppedWorkers, exported, line, serving
+from tests.kit.made_up_ground import made_up_flight, made_up_ground, write_map
 
 GRID = LocalGrid(32631)
 

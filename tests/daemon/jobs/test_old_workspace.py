@@ -5,10 +5,10 @@ import logging
 import pytest
 
 from gcs_plugin.daemon.daemon import Daemon
-from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
 from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.settings import Settings
 from tests.kit.made_up import after_job, complete, post
+from tests.kit.made_up_ground import made_up_flight, made_up_ground, write_map
 
 
 @pytest.fixture

@@ -9,7 +9,6 @@ import pytest
 
 from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.jobs.job_queue import Preempted, RunningJob
-from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
 from gcs_plugin.daemon.jobs.neighbours import ToneBalance, ToneTask, balance_tones
 from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.solution_file import SolutionFile, gains_of, read_solution
@@ -21,6 +20,7 @@ from orthoswarm.mosaic.render_passes import thumbnail
 from tests.kit import mosaic_scene as scene
 from tests.kit.daemon_kit import StoppedWorkers
 from tests.kit.made_up import after_job, complete, post
+from tests.kit.made_up_ground import made_up_flight, made_up_ground, write_map
 
 TONES = {"west": 1.0, "middle": 0.85, "east": 0.75}
 

@@ -19,8 +19,7 @@ from gcs_plugin.daemon.store.people_rows import Role
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from gcs_plugin.web.app import make_app
-from gcs_plugin.web.guard import Access
-from gcs_plugin.web.roles import NEEDS, need_of, route_of
+from gcs_plugin.web.guard import NEEDS, Access, need_of, route_of
 from tests.daemon.http.test_http_fuzz import content_of, path_of
 from tests.kit.daemon_kit import GRID, Shot, line
 from tests.kit.mosaic_scene import EAST, NORTH

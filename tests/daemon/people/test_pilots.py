@@ -2,10 +2,9 @@
 
 import pytest
 
-from gcs_plugin.daemon.pilots import GONE_S, Pilots
-from gcs_plugin.daemon.store.daemon_events import Events, HoldsChanged
+from gcs_plugin.daemon.store.daemon_events import Events, Told
 from gcs_plugin.daemon.store.journal import Journal
-from gcs_plugin.daemon.store.people_rows import OPERATOR, People, Person
+from gcs_plugin.daemon.store.people_rows import GONE_S, OPERATOR, People, Person, Pilots
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 
@@ -16,7 +15,7 @@ class Post:
         self.now, self.told = 0.0, []
         self.journal = Journal(path / "journal.db")
         events = Events()
-        events.on(HoldsChanged, self.told.append)
+        events.on(Told, lambda event: self.told.append(event) if event.page == "holds" else None)
         self.people = People(self.journal, events, clock=lambda: self.now)
         self.pilots = Pilots(self.people, events)
         self.anna, self.ben = self.joined("Anna"), self.joined("Ben")

@@ -13,8 +13,7 @@ from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store.people_rows import Role
 from gcs_plugin.fleet.commands import VERBS
 from gcs_plugin.web.app import STATIC, make_app
-from gcs_plugin.web.guard import Access
-from gcs_plugin.web.roles import LOCAL_PROGRAMS, NEEDS, need_of, route_of
+from gcs_plugin.web.guard import LOCAL_PROGRAMS, NEEDS, Access, need_of, route_of
 
 TOKEN = "a-token-of-tests"
 URL = "https://post.local:8650"

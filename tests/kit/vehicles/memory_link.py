@@ -6,14 +6,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from gcs_plugin.fleet.fleet import Fleet
-from gcs_plugin.fleet.fleet_events import FleetEvent
+from gcs_plugin.fleet.reception import FleetEvent
 from gcs_plugin.links.mavlink import Message
 from gcs_plugin.links.packets import Framer
 from gcs_plugin.links.signing import Packer
 from gcs_plugin.links.transports import NEVER, Link, Peer
 from gcs_plugin.mission.completion import MissionEvent
 from gcs_plugin.mission.exchange import Address, Exchange, Outcome
-from gcs_plugin.sim.lossy_radio import NO_FAULTS, Channel, Faults
+from gcs_plugin.sim.simulated_swarm import NO_FAULTS, Channel, Faults
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 
 

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from gcs_plugin.web.areas import area_of
+from gcs_plugin.web.uploads import area_of
 from orthoswarm.model.errors import InputError
 from tests.kit.page_kit import opened, refused, saved, standing, vehicle
 

@@ -7,7 +7,7 @@ import pytest
 
 from gcs_plugin.cli.main import main
 from gcs_plugin.mission.mission_files import parse_mission
-from gcs_plugin.web.areas import area_of
+from gcs_plugin.web.uploads import area_of
 from tests.planning.test_plan_files import survey_plan
 
 CAMERA = {

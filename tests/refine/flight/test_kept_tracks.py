@@ -7,13 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
-from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.raster.grey_pictures import GreyPictures
 from orthoswarm.refine.flight import kept_tracks
 from orthoswarm.refine.flight.kept_tracks import KeptTracks
 from orthoswarm.refine.strategy.swarm_refiner import RefinerOptions, SwarmRefiner
 from orthoswarm.refine.strategy.vehicle_passes import read_frame
+from tests.kit.made_up_ground import made_up_flight, made_up_ground, write_map
 
 EPSG, ORIGIN = 32631, np.array([500_000.0, 5_000_000.0])
 

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground
 from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Solution
 from orthoswarm.mosaic.recorded_pose import recorded_cameras
 from orthoswarm.raster.picture_file import read_gray
 from orthoswarm.refine.registration.late_pictures import centre_sigma, on_terrain, register_late_pictures, resected
+from tests.kit.made_up_ground import made_up_flight, made_up_ground
 from tests.kit.mosaic_scene import EAST, NORTH, hills, terrain_of
 
 EPSG = 32631

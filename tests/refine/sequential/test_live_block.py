@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.raster.picture_file import read_gray
 from orthoswarm.refine.registration.block_state import WorkArea
 from orthoswarm.refine.sequential.live_block import LiveBlock, spread_points
 from orthoswarm.refine.strategy.vehicle_passes import RefinerOptions, refine_alone
+from tests.kit.made_up_ground import made_up_flight, made_up_ground, write_map
 
 EPSG, ORIGIN, FIRST = 32631, np.array([500_000.0, 5_000_000.0]), 20
 GRID = LocalGrid(EPSG)

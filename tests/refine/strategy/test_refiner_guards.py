@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gcs_plugin.daemon.jobs import kernel_warmup
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.geo import LocalGrid
@@ -27,6 +26,7 @@ from orthoswarm.refine.strategy.vehicle_passes import (
     read_frame,
     refine_alone,
 )
+from tests.kit import made_up_ground as kernel_warmup
 
 EPSG, ORIGIN = 32631, np.array([500_000.0, 5_000_000.0])
 

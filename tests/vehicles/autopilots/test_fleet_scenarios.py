@@ -19,8 +19,8 @@ from gcs_plugin.links.transports import Link, parse_link
 from gcs_plugin.mission.items import CHANGE_SPEED, LAND, LOITER_UNLIM, RTL, TAKEOFF, TRIGGER_DISTANCE, WAYPOINT
 from gcs_plugin.mission.mission_builder import build_mission
 from gcs_plugin.mission.mission_files import FileItem
-from gcs_plugin.sim.lossy_radio import Channel, Faults
 from gcs_plugin.sim.multirotor import Chart
+from gcs_plugin.sim.simulated_swarm import Channel, Faults
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from tests.kit.vehicles.memory_link import World
 

@@ -20,7 +20,7 @@ from gcs_plugin.mission.exchange import Address
 from gcs_plugin.mission.geofence import FenceZone, zones_of
 from gcs_plugin.mission.items import RTL
 from gcs_plugin.mission.mission_files import FileItem
-from gcs_plugin.sim.lossy_radio import Faults
+from gcs_plugin.sim.simulated_swarm import Faults
 from tests.kit.daemon_kit import start, stop
 from tests.vehicles.autopilots.test_fleet_scenarios import ADDRESSES, REAL, Real, Site, further_link
 from tests.vehicles.autopilots.test_twin_camera import small_area

@@ -7,14 +7,14 @@ from dataclasses import replace
 import pytest
 
 from gcs_plugin.daemon.takeoffs import Takeoffs
+from gcs_plugin.fleet import autopilot_settings
 from gcs_plugin.fleet.autopilot_settings import Setting
 from gcs_plugin.fleet.preflight import Level, Wanted, preflight
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.items import FRAME_GLOBAL, FRAME_TERRAIN, RTL, TAKEOFF, WAYPOINT, Mission, MissionItem
 from gcs_plugin.mission.mission_builder import read_mission
-from gcs_plugin.sim.lossy_radio import Faults
-from gcs_plugin.sim.multirotor import Chart
-from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
+from gcs_plugin.sim.multirotor import Airframe, Chart
+from gcs_plugin.sim.simulated_swarm import Faults, SimSwarm, make_swarm
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from tests.kit.servers.ports import free_port
 from tests.vehicles.test_fleet_cli import HOME, fleet, folder  # noqa: F401
@@ -194,13 +194,13 @@ def test_a_vehicle_that_does_not_tell_is_warned_about(make_world):
 
 
 @pytest.mark.parametrize("backend", ["pymavlink", "mavsdk"])
-def test_no_vehicle_is_started_into_its_fence_from_the_command_line(folder, capsys, backend):  # noqa: F811
+def test_no_vehicle_is_started_into_its_fence_from_the_command_line(folder, capsys, backend, in_vehicle_time):  # noqa: F811
     if backend == "mavsdk":
         pytest.importorskip("mavsdk")
     port = free_port()
     link = f"udpin:127.0.0.1:{port}"
     links = ("--link", link, "--backend", backend, "--wait", 60)
-    vehicles = make_swarm(2, autopilots=(AP, PX4), home=HOME, spacing_m=30.0)
+    vehicles = make_swarm(2, autopilots=(AP, PX4), home=HOME, spacing_m=30.0, airframe=Airframe(climb_m_s=8.0))
     vehicles[0].parameters |= {"FENCE_ENABLE": 1, "FENCE_RADIUS": 30.0}
     vehicles[1].store.fence = list(FENCE)  # an area to stay in, elsewhere
     with SimSwarm(vehicles, f"udpout:127.0.0.1:{port}", speed=10.0):
@@ -238,6 +238,7 @@ def test_the_daemons_check_is_red_too(open_links, folder):  # noqa: F811
 @pytest.mark.parametrize("missing", [("RTL_ALT_TYPE",), None])
 def test_a_start_does_not_wait_for_what_is_never_told(open_links, folder, monkeypatch, missing):  # noqa: F811
     """One that is too old for a parameter, or that answers about none: its command would be too old by then."""
+    monkeypatch.setattr(autopilot_settings, "_ANSWER_S", 0.3)
     (vehicle,) = vehicles = make_swarm(1, home=HOME)
     for name in missing or list(vehicle.parameters):
         del vehicle.parameters[name]

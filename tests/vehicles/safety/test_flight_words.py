@@ -9,8 +9,8 @@ import pytest
 
 from gcs_plugin.fleet.flight_state import danger_of, flight_state
 from gcs_plugin.links.mavlink import Autopilot
-from gcs_plugin.sim.lossy_radio import Faults
 from gcs_plugin.sim.mission_flight import MissionState
+from gcs_plugin.sim.simulated_swarm import Faults
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from tests.kit.vehicles.memory_link import World
 from tests.vehicles.safety.two_stations import ARM, BY_HAND, HOME, LOITER, OtherStation, short_mission

@@ -9,7 +9,7 @@ from gcs_plugin.fleet.preflight import Level, Wanted, preflight
 from gcs_plugin.fleet.separation.separation_watch import SeparationWatch
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.exchange import Address
-from gcs_plugin.sim.lossy_radio import Faults
+from gcs_plugin.sim.simulated_swarm import Faults
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from tests.vehicles.test_preflight import CHART, line
 

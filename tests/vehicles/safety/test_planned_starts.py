@@ -168,7 +168,7 @@ def test_a_vehicle_whose_takeoff_waits_takes_no_other_mission(open_links, folder
 
 
 def test_what_has_become_red_until_the_takeoff_holds_the_vehicle_and_the_rest(open_links, folder):  # noqa: F811
-    apart(folder, 3, 4.0)
+    apart(folder, 3, 2.0)
     vehicles = make_swarm(3, home=HOME)
     links = open_links(vehicles)
     ready(links, 3)
@@ -184,11 +184,11 @@ def test_what_has_become_red_until_the_takeoff_holds_the_vehicle_and_the_rest(op
     takeoffs.close()
 
 
-def plan_of_two(open_links, folder, seconds):  # noqa: F811
+def plan_of_two(open_links, folder, seconds, speed=10.0):  # noqa: F811
     """Two vehicles that take off so many seconds after each other, and the plan's start."""
     apart(folder, 2, seconds)
     vehicles = make_swarm(2, home=HOME)
-    links = open_links(vehicles, speed=4.0)
+    links = open_links(vehicles, speed=speed)
     ready(links, 2)
     upload_all(links, folder)
     said = []
@@ -198,7 +198,7 @@ def plan_of_two(open_links, folder, seconds):  # noqa: F811
 
 
 def test_a_waiting_vehicle_that_somebody_else_returns_stays_on_the_ground(open_links, folder):  # noqa: F811
-    vehicles, _, takeoffs, said = plan_of_two(open_links, folder, 6.0)
+    vehicles, _, takeoffs, said = plan_of_two(open_links, folder, 3.0)
     wait(lambda: vehicles[0].flight.motion.up > 4.0)
     for vehicle in vehicles:  # by another station: ours hears of it by the vehicles' messages only
         vehicle.flight.set_mode(vehicle.flight.modes.rtl)
@@ -210,7 +210,7 @@ def test_a_waiting_vehicle_that_somebody_else_returns_stays_on_the_ground(open_l
 
 
 def test_nobody_follows_one_that_does_not_leave_the_ground(open_links, folder):  # noqa: F811
-    vehicles, _, takeoffs, _ = plan_of_two(open_links, folder, 1.0)
+    vehicles, _, takeoffs, _ = plan_of_two(open_links, folder, 1.0, speed=4.0)
     first = vehicles[0].flight
     wait(lambda: first.armed and first.mode == first.modes.mission)
     first.set_mode(first.modes.rtl)
@@ -222,7 +222,7 @@ def test_nobody_follows_one_that_does_not_leave_the_ground(open_links, folder): 
 
 
 def test_a_mission_that_somebody_replaces_while_a_takeoff_waits_is_not_flown(open_links, folder):  # noqa: F811
-    vehicles, _, takeoffs, _ = plan_of_two(open_links, folder, 4.0)
+    vehicles, _, takeoffs, _ = plan_of_two(open_links, folder, 2.0)
     store = vehicles[1].store
     store.items = [*store.items[:3], *(replace(item, z=item.z + 9.0) for item in store.items[3:])]
     store.generation += 1

@@ -6,7 +6,7 @@ from gcs_plugin.fleet.commands import Order
 from gcs_plugin.fleet.flight_state import Word, flight_state
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.exchange import Verdict
-from gcs_plugin.sim.lossy_radio import Faults
+from gcs_plugin.sim.simulated_swarm import Faults
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from tests.vehicles.test_commands import end_of, flying, give
 from tests.vehicles.test_fleet import END

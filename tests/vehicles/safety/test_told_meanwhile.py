@@ -11,8 +11,8 @@ from gcs_plugin.links.packets import Framer
 from gcs_plugin.mission.completion import CompletionDetector, MissionEvent
 from gcs_plugin.mission.exchange import Address
 from gcs_plugin.mission.start_dialogue import LastLook
-from gcs_plugin.sim.lossy_radio import NO_FAULTS, Faults
 from gcs_plugin.sim.mission_flight import MissionState
+from gcs_plugin.sim.simulated_swarm import NO_FAULTS, Faults
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from tests.kit.vehicles.memory_link import World
 from tests.vehicles.safety.two_stations import ARM, CURRENT, HOME, SET_MODE, START, OtherStation, short_mission

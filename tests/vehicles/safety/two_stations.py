@@ -15,8 +15,8 @@ from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.exchange import GROUND_STATION, Address
 from gcs_plugin.mission.flight_modes import mode_params
 from gcs_plugin.mission.items import CHANGE_SPEED, LAND, RTL, TAKEOFF, WAYPOINT, Mission, MissionItem
-from gcs_plugin.sim.lossy_radio import Faults
 from gcs_plugin.sim.multirotor import Chart
+from gcs_plugin.sim.simulated_swarm import Faults
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.errors import OrthoSwarmError
 from tests.kit.vehicles.memory_link import World

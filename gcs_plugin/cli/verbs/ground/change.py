@@ -30,8 +30,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compare, write, print."""
-    from gcs_plugin.cli.arguments import require_no_file
-    from gcs_plugin.cli.progress import ProgressBars
+    from gcs_plugin.cli.arguments import ProgressBars, require_no_file
     from orthoswarm.change.of_folder import change_of
     from orthoswarm.compute.workers import prepare_process
     from orthoswarm.report.page import put_section

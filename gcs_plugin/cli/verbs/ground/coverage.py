@@ -117,7 +117,7 @@ def _events(logs: list[str], flown: "MapFolder", grid: "LocalGrid") -> "list[Cam
 
 def _judged(flown: "MapFolder") -> "MapFolder":
     """The map's pictures with their quality."""
-    from gcs_plugin.cli.progress import ProgressBars
+    from gcs_plugin.cli.arguments import ProgressBars
     from orthoswarm.coverage.map_folder import with_flaws
 
     if flown.root is None or not flown.root.is_dir():

@@ -5,7 +5,8 @@ There is one session, and a repeated request (one with the number of the last) g
 
 from dataclasses import dataclass, field
 
-from gcs_plugin.links.file_transfer import MOST_DATA, FtpPayload, Nak, Opcode, file_crc32
+from gcs_plugin.links.file_transfer import MOST_DATA, FtpPayload, Nak, Opcode, file_crc32, payload_of
+from gcs_plugin.sim.simulated_vehicle import SimVehicle
 
 
 @dataclass(slots=True, kw_only=True)
@@ -87,6 +88,28 @@ class FileServer:
         data = self.files[self._open][request.offset : request.offset + min(request.size, MOST_DATA)]
         self.served += len(data)
         return data or Nak.END_OF_FILE
+
+
+class CardVehicle(SimVehicle):
+    """A simulated vehicle that serves its files; None for one without a server."""
+
+    def __init__(self, files, **options):
+        super().__init__(**options)
+        self.files = files
+
+    def handle(self, message, sender, now):
+        """Answer requests for files, too."""
+        answers = super().handle(message, sender, now)
+        served = self.files is not None and not self.off and message.get_type() == "FILE_TRANSFER_PROTOCOL"
+        if not served or message.target_system not in (0, self.system) or (request := payload_of(message)) is None:
+            return answers
+        return [self.files.answer(request).message(sender.system, sender.component)]
+
+    def reboot(self, now, silence_s=3.0):
+        """Restart, the server too."""
+        super().reboot(now, silence_s)
+        if self.files is not None:
+            self.files.rebooted()
 
 
 def _text(data: bytes) -> str:

@@ -1,7 +1,4 @@
-"""A tiny refinement of synthetic pictures, which loads a worker's compiled kernels before they are needed.
-
-Loading them takes some seconds in a fresh process, as long as refining a hundred pictures.
-"""
+"""Flights over a made-up ground, and what is drawn and refined of them."""
 
 import contextlib
 import tempfile
@@ -18,14 +15,25 @@ from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Fix, Frame
 from orthoswarm.model.geo import GroundGrid, LocalGrid
 from orthoswarm.mosaic.radiometry import estimate_fields
+from orthoswarm.mosaic.realtime import RealtimeMosaic
 from orthoswarm.mosaic.renderer import render
 from orthoswarm.raster.basemap import Basemap
+from orthoswarm.raster.picture_quality import picture_quality
 
 _EPSG: Final = 32631
 _EAST, _NORTH = 500_000.0, 5_000_000.0
 _SIDE_M: Final = 420
 _HEIGHT_M: Final = 60.0
 _LENS: Final = Lens(240, 180, focal_px(float(np.radians(70.0)), 240))
+
+
+def draw_something(folder: Path) -> None:
+    """Draw a grey picture in real time, and judge it."""
+    camera = Camera(np.array([16.0, 16.0, 30.0]), rotation_from_angles(0.0, NADIR_PITCH_RAD, 0.0), Lens(32, 24, 30.0))
+    grid = GroundGrid(epsg=_EPSG, west=0.0, north=64.0, gsd_m=1.0, width=64, height=64)
+    with Canvas.create(folder / "drawn", grid, tile_px=64) as canvas:
+        RealtimeMosaic(canvas).add(np.full((24, 32, 4), 255, np.uint8), camera)
+    picture_quality(np.zeros((24, 32, 4), np.uint8))
 
 
 def refine_something() -> None:
