@@ -17,7 +17,7 @@ from orthoswarm.matchers.patch_registration import apply
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.geo import LocalGrid, local_origin
 from orthoswarm.mosaic.recorded_pose import area_grid
-from orthoswarm.paper.leg_lines import find_legs, fit_line
+from orthoswarm.paper.coarse_cameras import find_legs, fit_line
 from orthoswarm.refine.bundle.flight_records import read_records
 
 MIDDLE = 0.35

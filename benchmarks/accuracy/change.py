@@ -29,11 +29,11 @@ import rasterio
 
 from benchmarks.accuracy.other_dates import KINDS
 from benchmarks.robustness.wrong_maps import altered, averaged, darkened, season
-from orthoswarm.change import likelihood
+from orthoswarm.change import evidence
+from orthoswarm.change.change_files import overlay_pixels
 from orthoswarm.change.change_map import cells_of, map_change, measured_blocks
 from orthoswarm.change.changed_objects import LEAST_M2, find_objects
 from orthoswarm.change.of_folder import WANT_M, scene_of
-from orthoswarm.change.overlay import overlay_pixels
 from orthoswarm.coverage.map_folder import read_map
 
 LARGE_M2 = 100.0
@@ -157,8 +157,8 @@ def fit(folders, kinds, target):
             case = truth(folder, grid)
             own, of = [], []
             for block in measured_blocks(compared, grid):
-                good = block.drawn & (block.found.seen > 0.5) & ~block.hidden
-                own.append(block.found.values[good])
+                good = block.drawn & (block.seen > 0.5) & ~block.hidden
+                own.append(block.values[good])
                 of.append(case[block.rows, block.columns][good])
             x, y = np.concatenate(own), np.concatenate(of)
             k = random.choice(len(x), min(len(x), SAMPLES * (3 if (y == CASE["collapse"]).any() else 1)), replace=False)
@@ -168,7 +168,7 @@ def fit(folders, kinds, target):
     x, y = np.concatenate(values), np.concatenate(cases)
     mean, spread = x.mean(0), x.std(0) + 1e-6
     inputs, wanted = (
-        torch.tensor(np.clip((x - mean) / spread, -likelihood.MOST, likelihood.MOST)),
+        torch.tensor(np.clip((x - mean) / spread, -evidence.MOST, evidence.MOST)),
         torch.tensor(y).long(),
     )
     torch.manual_seed(0)
@@ -235,7 +235,7 @@ def main() -> None:
     parser.add_argument("what", choices=("measure", "fit", "draw"))
     parser.add_argument("sets", nargs="+", metavar="SET")
     parser.add_argument("--maps", nargs="+", choices=MAPS, default=None)
-    parser.add_argument("--weights", type=Path, default=Path(likelihood.__file__).with_name("weights.npz"))
+    parser.add_argument("--weights", type=Path, default=Path(evidence.__file__).with_name("weights.npz"))
     parser.add_argument("--out", type=Path, default=Path("change.jpg"))
     args = parser.parse_args()
     if args.what == "draw":

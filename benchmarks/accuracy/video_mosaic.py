@@ -24,7 +24,7 @@ def encode(frames: list[Frame], target: Path, codec: str, crf: int) -> None:
     import av
 
     from orthoswarm.raster.picture_file import read_rgb
-    from telemetry.samples.sample_frame import sample_of
+    from telemetry.samples.sample import sample_of
     from telemetry.write.sei_writer import add_sei
 
     plain = target.with_suffix(".plain.mp4")

@@ -107,7 +107,7 @@ def simulate(seed: int, side_m: float = 500.0) -> Outcome:
     said = cover.states()
     wanted = cells.wanted
     solved = footprint(height, math.radians(min(planning_fovs_deg(cover.views).values())))
-    missing = missing_by_events(cover.views, flown.events).pictures
+    missing, _ = missing_by_events(cover.views, flown.events)
     listed = {m.view.image for m in missing if m.cause is Cause.NOT_ARRIVED}
     after = _fly_gaps(plan, cover, truth, solved=solved, rng=rng, fov_deg=true_fov, planned=foot, events=flown.events)
     return Outcome(
@@ -231,7 +231,7 @@ def _fly_gaps(
     legs = grid.to_grid(places[..., 0], places[..., 1])
     fov = 2.0 * math.atan(0.5 * planned.width_m / plan.altitude_m)
     for _ in range(_ROUNDS):
-        missing = missing_by_events(cover.views, events).pictures
+        missing, _ = missing_by_events(cover.views, events)
         gaps = find_gaps(cover, missing, PlannedFlight(legs, planned.width_m, planned.height_m, fov))
         if not gaps.gaps:
             break

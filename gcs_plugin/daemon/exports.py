@@ -41,8 +41,7 @@ from gcs_plugin.daemon.store.picture_store import PictureStore
 from gcs_plugin.daemon.store.sortie_rows import coarse_only, placed_sorties
 from gcs_plugin.daemon.vehicle_names import VehicleRow
 from gcs_plugin.daemon.views import Views
-from orthoswarm.change.change_files import FIGURES
-from orthoswarm.change.overlay import change_overlay, figures_in
+from orthoswarm.change.change_files import FIGURES, change_overlay, figures_in
 from orthoswarm.export.atomic_file import atomic_write, write_file
 from orthoswarm.export.tactical.cursor_on_target import TakAddress, TakSender, event
 from orthoswarm.export.tactical.places import Place, sightings
@@ -321,7 +320,7 @@ class ChangeTask:
 def find_change(task: ChangeTask) -> dict[str, Any]:
     """Compare the products of a workspace with its basemap; returns the shares."""
     from orthoswarm.change.of_folder import change_of
-    from orthoswarm.report.change_section import put_section
+    from orthoswarm.report.page import put_section
 
     figures = change_of(
         task.workspace, task.workspace, basemap=task.basemap,

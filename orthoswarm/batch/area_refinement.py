@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from orthoswarm.batch.run_state import RunContext
 from orthoswarm.compute.workers import trim_memory
 from orthoswarm.control.area_adjustment import AreaMove, AreaTie, adjust_areas
-from orthoswarm.control.moved_block import moved_camera, moved_terrain
+from orthoswarm.control.similarity import moved_camera, moved_terrain
 from orthoswarm.model.arrays import Array, Floats
 from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.frame import Frame

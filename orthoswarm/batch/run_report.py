@@ -24,7 +24,6 @@ from orthoswarm.batch.run_state import (
 from orthoswarm.config import changes
 from orthoswarm.evaluation.checkpoints import control_rows, evaluate_checkpoints
 from orthoswarm.export.catalog.tiled_raster import remove_collection, remove_product, tiles_of
-from orthoswarm.export.ground_file import GROUND, write_ground
 from orthoswarm.export.product_files import (
     image_root,
     iso_time,
@@ -33,6 +32,7 @@ from orthoswarm.export.product_files import (
     write_frames,
     write_json,
 )
+from orthoswarm.export.value_raster import GROUND, write_ground
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.placement import PlacedFrame, Refinement, Terrain
 from orthoswarm.mosaic.extent import from_takeoff, ground_level, solved_level
@@ -160,7 +160,7 @@ def make_surface(
         placed: the frames with the stated heights. moved_m: by how much these were moved.
         refinement: what placed them; None if they lie as recorded.
     """
-    from orthoswarm.export.surface_file import write_surface  # a fifth of a second that other runs do without
+    from orthoswarm.export.value_raster import write_surface  # a fifth of a second that other runs do without
     from orthoswarm.stereo.surface_model import surface_model
 
     path = run.options.surface

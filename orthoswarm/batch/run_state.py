@@ -13,7 +13,7 @@ from orthoswarm.config import DEFAULT, Config
 from orthoswarm.control.ground_control import GroundControl
 from orthoswarm.evaluation.checkpoints import Checkpoint
 from orthoswarm.export.catalog.tiled_raster import FOLDER, Tiles, is_tile_or_collection
-from orthoswarm.export.ground_file import GROUND
+from orthoswarm.export.value_raster import GROUND
 from orthoswarm.model.arrays import Bytes, Floats
 from orthoswarm.model.frame import Ingest, Rejection
 from orthoswarm.model.geo import LocalGrid

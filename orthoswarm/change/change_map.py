@@ -1,19 +1,21 @@
-"""The change of an area against its pre-disaster map, block by block of cells, so that memory is bounded."""
+"""The change of an area against its pre-disaster map, block by block of cells, so that memory is bounded.
+
+The map itself lies beside its place by small local offsets, and its leaning buildings hide ground.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from orthoswarm.change.evidence import Block, Measured, measured
-from orthoswarm.change.likelihood import probabilities
+from orthoswarm.change.evidence import measured, probabilities
 from orthoswarm.change.looks import FINE, ToneModel, cell_looks, on_cells
-from orthoswarm.change.map_ground import hidden_on_map, local_offsets, shifted
 from orthoswarm.change.seen_ground import Read, heights_on, seen_ground
-from orthoswarm.change.structure import structure
+from orthoswarm.change.structure import blurred, structure
 from orthoswarm.coverage.view import View
 from orthoswarm.model.arrays import Bytes, Flags, Floats
 from orthoswarm.model.bounding_box import BoundingBox
@@ -30,41 +32,34 @@ _THICK: Final = 0.6  # share of haze that hides the ground
 _SEEN: Final = 0.5  # share of a cell that pictures must see
 _RIM_M: Final = 3.0  # along the edges of the map's data there are edges that the ground does not have
 _DISTORTED_PX: Final = 1.0  # offsets of the map below this are those of what leans, not of the map
+_TILE_PX: Final = 64  # side of the parts whose offset is measured
+_FARTHEST_PX: Final = 4  # offsets: a map's own distortion is up to 3 m
+_CLEAR: Final = 6.0  # a peak so many sigmas above the others' is believed
+_HIDES_M: Final = 2.0  # what is higher than the line of sight by this hides
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparedScene:
-    """What is compared.
+    """What is compared."""
 
-    Attributes:
-        views: refined pictures, in the map's grid. terrain: the ground they lie on. basemap: the pre-disaster map.
-        orthoimage: the refined one. read: gives a view's grey values. lean: of the map, metres a metre of height.
-    """
-
-    views: Sequence[View]
-    terrain: Terrain
-    basemap: Basemap
-    orthoimage: Path
-    read: Read
-    lean: tuple[float, float]
+    views: Sequence[View]  # refined pictures, in the map's grid
+    terrain: Terrain  # the ground they lie on
+    basemap: Basemap  # the pre-disaster map
+    orthoimage: Path  # the refined one
+    read: Read  # gives a view's grey values
+    lean: tuple[float, float]  # of the map, metres a metre of height
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChangeMap:
-    """The change of an area; all (rows, columns).
+    """The change of an area; all (rows, columns)."""
 
-    Attributes:
-        grid: its cells. probability: uint8, that the ground changed, 0 to 255. visible: bool, where that can be said.
-        inside: bool, where the orthoimage shows the ground. case: uint8, the likeliest of CASES but the first.
-        height: float32, what stands above the bare ground now, metres.
-    """
-
-    grid: GroundGrid
-    probability: Bytes
-    visible: Flags
-    inside: Flags
-    case: Bytes
-    height: Floats
+    grid: GroundGrid  # its cells
+    probability: Bytes  # uint8, that the ground changed, 0 to 255
+    visible: Flags  # bool, where that can be said
+    inside: Flags  # bool, where the orthoimage shows the ground
+    case: Bytes  # uint8, the likeliest of CASES but the first
+    height: Floats  # float32, what stands above the bare ground now, metres
 
     @classmethod
     def blank(cls, grid: GroundGrid) -> "ChangeMap":
@@ -77,19 +72,17 @@ class ChangeMap:
 
 
 class MeasuredBlock(NamedTuple):
-    """What is measured of a block of an area's cells.
+    """What is measured of a block of an area's cells."""
 
-    Attributes:
-        rows, columns: which cells. found: of these. drawn, hidden: bool, where the orthoimage shows them, and where the
-            map shows what stands before them. height: float32, what stands above the bare ground now, metres.
-    """
-
-    rows: slice
-    columns: slice
-    found: Measured
+    rows: slice  # which cells
+    columns: slice  # which cells
+    values: Floats  # float32 (rows, columns, features), what the probability is computed from
+    seen: Floats  # float32, 0 to 1, how much of each pictures see and the map has
+    veil: Floats  # share of its light that is haze, less that of the map
+    # drawn, hidden: bool, where the orthoimage shows them, and where the map shows what stands before them
     drawn: Flags
     hidden: Flags
-    height: Floats
+    height: Floats  # float32, what stands above the bare ground now, metres
 
 
 def map_change(
@@ -105,11 +98,10 @@ def map_change(
     out = ChangeMap.blank(grid)
     of = -(-grid.height // _BLOCK) * -(-grid.width // _BLOCK)
     for done, block in enumerate(measured_blocks(scene, grid), start=1):
-        window, found = (block.rows, block.columns), block.found
-        chance = probabilities(found.values)
+        window, chance = (block.rows, block.columns), probabilities(block.values)
         out.inside[window] = block.drawn
         out.probability[window] = np.round(255 * (1.0 - chance[..., 0]))
-        out.visible[window] = block.drawn & (found.seen > _SEEN) & (found.veil < _THICK) & ~block.hidden
+        out.visible[window] = block.drawn & (block.seen > _SEEN) & (block.veil < _THICK) & ~block.hidden
         out.case[window] = 1 + cv2.medianBlur(chance[..., 1:].argmax(-1).astype(np.uint8), 5)
         out.height[window] = block.height
         progress(done, of)
@@ -161,18 +153,18 @@ def _measured_block(
         offset[np.hypot(offset[..., 0], offset[..., 1]) < _DISTORTED_PX] = 0.0
         gray = shifted(gray, offset)
         before = structure(gray, pixels.gsd_m)
-    block = Block(seen, before, gray, valid, cell_looks(picture), cell_looks(fine), drawn, per_cell, cell)
-    height = _above_ground(own, terrain)
+    values, shown, veil = measured(
+        seen, before, gray, valid, now=cell_looks(picture), then=cell_looks(fine), drawn=drawn, tone=tone,
+        per_cell=per_cell, cell_m=cell,
+    )  # fmt: skip
+    height = np.zeros(drawn.shape, np.float32)
+    if terrain.bare is not None:
+        height = heights_on(own, terrain, terrain.z - terrain.bare)
     inner = np.s_[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN]
-    found = Measured(*(part[inner] for part in measured(block, tone)))
     hidden = hidden_on_map(height, scene.lean, cell)
-    return MeasuredBlock(rows, columns, found, drawn[inner], hidden[inner], height[inner])
-
-
-def _above_ground(grid: GroundGrid, terrain: Terrain) -> Floats:
-    if terrain.bare is None:
-        return np.zeros((grid.height, grid.width), np.float32)
-    return heights_on(grid, terrain, terrain.z - terrain.bare)
+    return MeasuredBlock(
+        rows, columns, values[inner], shown[inner], veil[inner], drawn[inner], hidden[inner], height[inner]
+    )
 
 
 def _thinned(views: Sequence[View], terrain: Terrain) -> list[View]:
@@ -229,3 +221,79 @@ def orthoimage_window(path: Path, cells: GroundGrid, per_cell: int) -> tuple[Byt
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     out = cv2.warpAffine(np.ascontiguousarray(bands), place, (columns, rows), flags=flags)
     return np.ascontiguousarray(out[..., :3]), out[..., 3]
+
+
+def local_offsets(before: Floats, now: Floats) -> Floats:
+    """How far a map's structure lies from the pictures', float32 (rows, columns, 2): columns and rows, in pixels.
+
+    Parts of _TILE_PX are correlated; what is not clear is taken from its neighbours, 0 where there is none.
+
+    before, now: structure of map and pictures, float32 (rows, columns, 2 or more), gradients first.
+    """
+    rows, columns = (max(1, side // _TILE_PX) for side in before.shape[:2])
+    found = np.zeros((rows, columns, 3), np.float32)
+    taper = np.outer(*[np.hanning(_TILE_PX + 2)[1:-1]] * 2).astype(np.float32)
+    for r in range(rows):
+        for c in range(columns):
+            part = np.s_[r * _TILE_PX : (r + 1) * _TILE_PX, c * _TILE_PX : (c + 1) * _TILE_PX]
+            a, b = (np.ascontiguousarray(f[part][..., :2]).view(np.complex64)[..., 0] for f in (before, now))
+            if a.shape == taper.shape:
+                found[r, c] = _peak(a * taper, b * taper)
+    weight = found[..., 2].copy()
+    near = blurred(weight, 0.8)
+    smooth = np.dstack([blurred(found[..., k] * weight, 0.8) for k in range(2)]) / np.maximum(near, 1e-6)[..., None]
+    smooth[near < 1e-3] = 0.0
+    size = (before.shape[1], before.shape[0])
+    return np.asarray(cv2.resize(smooth.astype(np.float32), size, interpolation=cv2.INTER_LINEAR))
+
+
+def _peak(before: NDArray[Any], now: NDArray[Any]) -> tuple[float, float, float]:
+    """Offset of one part, columns and rows, and its weight, 0 where it is not clear; complex gradients."""
+    both = np.fft.ifft2(np.fft.fft2(before) * np.conj(np.fft.fft2(now))).real
+    spread = float(both.std())
+    n = _FARTHEST_PX
+    near = np.roll(both, (n, n), (0, 1))[: 2 * n + 1, : 2 * n + 1]
+    row, column = np.unravel_index(int(near.argmax()), near.shape)
+    clear = float(near[row, column]) / max(spread, 1e-9)
+    if clear < _CLEAR or row in (0, 2 * n) or column in (0, 2 * n):
+        return 0.0, 0.0, 0.0
+
+    def between(low: float, middle: float, high: float) -> float:
+        bend = low - 2 * middle + high
+        return 0.5 * (low - high) / bend if bend < 0 else 0.0
+
+    dy = between(*near[row - 1 : row + 2, column])
+    dx = between(*near[row, column - 1 : column + 2])
+    return column - n + dx, row - n + dy, clear
+
+
+def shifted(values: Floats, offset: Floats) -> Floats:
+    """Values taken at each pixel plus an offset (columns, rows), float32 (rows, columns, 2)."""
+    row, column = (a.astype(np.float32) for a in np.indices(values.shape[:2]))
+    return np.asarray(
+        cv2.remap(
+            values, column + offset[..., 0], row + offset[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+        )
+    )
+
+
+def hidden_on_map(height: Floats, lean: tuple[float, float], gsd_m: float) -> Flags:
+    """Where the map shows what stands before the ground, bool (rows, columns).
+
+    Args:
+        height: above the bare ground, float32, metres. lean: shift on the map a metre of height, (east, north).
+        gsd_m: of the pixels.
+    """
+    slope, top = float(np.hypot(*lean)), float(height.max())
+    hidden = np.zeros(height.shape, bool)
+    if slope < 1e-3 or top < _HIDES_M:
+        return hidden
+    # Ground at p is hidden by what stands at p - lean * h, as that is shown at p.
+    for k in range(1, int(np.ceil(top * slope / gsd_m)) + 1):
+        away = k * gsd_m / slope
+        dx, dy = round(-lean[0] / slope * k), round(lean[1] / slope * k)
+        hidden |= (
+            cv2.warpAffine(height, np.array([[1, 0, -dx], [0, 1, -dy]], np.float32), height.shape[::-1])
+            > away + _HIDES_M
+        )
+    return hidden

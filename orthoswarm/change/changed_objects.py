@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from orthoswarm.change.change_map import ChangeMap
-from orthoswarm.change.likelihood import CASES
+from orthoswarm.change.evidence import CASES
 from orthoswarm.coverage.view import View
 
 LEAST_M2: Final = 25.0  # smaller objects are not listed
@@ -20,20 +20,14 @@ _OUTLINE_CELLS: Final = 0.6  # the outline may be so far beside the cells' edges
 
 
 class ChangedObject(NamedTuple):
-    """Changed ground.
+    """Changed ground."""
 
-    Attributes:
-        area_m2: its area. probability: mean over it, 0 to 1. kind: in a word.
-        outline: shapely polygon in the map's grid, with holes. place: float64 (3,), a point of it and its height.
-        photos: (vehicle, image) of those that show it best, the best first.
-    """
-
-    area_m2: float
-    probability: float
-    kind: str
-    outline: Any
-    place: np.ndarray
-    photos: tuple[tuple[str, str], ...]
+    area_m2: float  # its area
+    probability: float  # mean over it, 0 to 1
+    kind: str  # in a word
+    outline: Any  # shapely polygon in the map's grid, with holes
+    place: np.ndarray  # float64 (3,), a point of it and its height
+    photos: tuple[tuple[str, str], ...]  # (vehicle, image) of those that show it best, the best first
 
 
 def find_objects(

@@ -14,18 +14,12 @@ _DARK: Final = 12.0  # grey values that noise and haze add: dark colours have no
 
 
 class CellLooks(NamedTuple):
-    """Looks of cells, all float32 (rows, columns) but `color` (rows, columns, 3) and `order`.
+    """Looks of cells, all float32 (rows, columns) but `color` (rows, columns, 3) and `order`."""
 
-    Attributes:
-        color: mean red, green, blue, 0 to 255. edges: mean gradient, grey values a pixel. spots: mean of how much a
-            pixel differs from those around it. order: (rows, columns, 3), gradients with their angles times four, and
-            their lengths.
-    """
-
-    color: Floats
-    edges: Floats
-    spots: Floats
-    order: Floats
+    color: Floats  # mean red, green, blue, 0 to 255
+    edges: Floats  # mean gradient, grey values a pixel
+    spots: Floats  # mean of how much a pixel differs from those around it
+    order: Floats  # (rows, columns, 3), gradients with their angles times four, and their lengths
 
 
 def on_cells(values: NDArray[Any], per_cell: int) -> Floats:
@@ -69,15 +63,12 @@ class ToneModel(NamedTuple):
 
     A linear map of all, and for each of some classes of colours what its ground differs from that, and how much it
     varies; found by robust means, as most of the ground is unchanged.
-
-    Attributes:
-        linear: (4, 3). classes: (K, 3), hues of the map. shift, spread: (K, 3).
     """
 
-    linear: Floats
-    classes: Floats
-    shift: Floats
-    spread: Floats
+    linear: Floats  # (4, 3)
+    classes: Floats  # (K, 3), hues of the map
+    shift: Floats  # (K, 3)
+    spread: Floats  # (K, 3)
 
     @classmethod
     def of(cls, before: Floats, now: Floats, both: Flags) -> "ToneModel":
@@ -85,17 +76,15 @@ class ToneModel(NamedTuple):
         b, a = hue(before[both]), hue(now[both])
         step = max(1, len(b) // _SAMPLES)
         b, a = b[::step], a[::step]
-        design, weight = np.c_[np.ones(len(b)), b], np.ones(len(b))
-        linear = np.zeros((4, 3))
-        if len(b) >= _FEWEST:
-            for _ in range(8):
-                linear = np.linalg.lstsq(design * weight[:, None], a * weight[:, None], rcond=None)[0]
-                rest = a - design @ linear
-                spread = 1.48 * np.median(np.abs(rest), 0) + 0.01
-                weight = 1.0 / (1.0 + ((rest / spread / 2.0) ** 2).sum(1))
         if len(b) < _FEWEST:
             nothing = np.zeros((1, 3), np.float32)
-            return cls(linear.astype(np.float32), nothing, nothing, nothing + np.float32(np.inf))
+            return cls(np.zeros((4, 3), np.float32), nothing, nothing, nothing + np.float32(np.inf))
+        design, weight = np.c_[np.ones(len(b)), b], np.ones(len(b))
+        for _ in range(8):
+            linear = np.linalg.lstsq(design * weight[:, None], a * weight[:, None], rcond=None)[0]
+            rest = a - design @ linear
+            spread = 1.48 * np.median(np.abs(rest), 0) + 0.01
+            weight = 1.0 / (1.0 + ((rest / spread / 2.0) ** 2).sum(1))
         cv2.setRNGSeed(1)
         ends = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 20, 1e-3)
         _, label, classes = cv2.kmeans(b * _HUE_WEIGHT, _CLASSES, None, ends, 1, cv2.KMEANS_PP_CENTERS)
@@ -110,8 +99,7 @@ class ToneModel(NamedTuple):
     def differs(self, before: Floats, now: Floats) -> tuple[Floats, Floats]:
         """How far colours (rows, columns, 3) are from what they should have become.
 
-        Returns:
-            In spreads, squared, at most _MOST, and as a difference of hues; float32 (rows, columns).
+        Returns in spreads, squared, at most _MOST, and as a difference of hues; float32 (rows, columns).
         """
         b, a = hue(before), hue(now)
         nearest, least = np.zeros(b.shape[:2], np.intp), np.full(b.shape[:2], np.inf, np.float32)

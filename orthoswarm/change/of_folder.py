@@ -1,7 +1,7 @@
 """The change of a finished map: reads its folder, compares, and writes the files."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,7 +13,7 @@ from orthoswarm.change.changed_objects import find_objects
 from orthoswarm.coverage.map_folder import MapFolder, read_map
 from orthoswarm.coverage.view import View
 from orthoswarm.export.catalog.tiled_raster import product_file
-from orthoswarm.export.ground_file import GROUND, read_ground
+from orthoswarm.export.value_raster import GROUND, read_ground
 from orthoswarm.model.arrays import Bytes
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
@@ -74,65 +74,44 @@ def scene_of(
     missing: set[str] | None = None,
 ) -> tuple[ComparedScene, list[str]]:
     """What is compared, and warnings; arguments and errors as of `change_of`, `missing` takes pictures not readable."""
+    import rasterio
+
     orthoimage = product_file(folder, "orthoimage.tif")
     if orthoimage is None:
         raise InputError(f"{folder} holds no orthoimage.tif; make the map with `orthoswarm mosaic` first")
     report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
-    before = _basemap(basemap, report, flown.epsg, orthoimage)
+    if basemap is None and not report.get("basemap"):
+        raise InputError("the map was made without a basemap; give the pre-disaster map with --basemap")
+    with rasterio.open(orthoimage) as file:
+        near = BoundingBox(*file.bounds)
+    before = Basemap.open(path_of(str(report["basemap"])) if basemap is None else basemap, flown.epsg, near)
     warnings = list(flown.warnings)
     if any(not view.placed for view in flown.views) or not report.get("basemap"):
         warnings.append("pictures that were not laid on the map may lie metres beside it: what differs there may not")
     ground = folder / GROUND
     terrain = read_ground(ground) if ground.exists() else Terrain.flat(flown.ground_z_m)
-    root = flown.root
-
-    def file_of(view: View) -> Path | None:
-        if find is not None:
-            return find(view.vehicle, view.image)
-        return None if root is None else root / view.image
 
     unread = set() if missing is None else missing
-    cell = max(want_m, before.native_gsd_m)
+    pixel_m = 0.5 * max(want_m, before.native_gsd_m)
 
     def read(view: View) -> Bytes | None:
-        path = file_of(view)
-        gsd = (float(view.position[2]) - flown.ground_z_m) / view.lens.focal_px
+        """A picture as soft as the pixels on which it is drawn."""
+        path = find(view.vehicle, view.image) if find else flown.root and flown.root / view.image
+        lens, gsd = view.lens, (float(view.position[2]) - flown.ground_z_m) / view.lens.focal_px
+        wanted = round(lens.width * min(1.0, gsd / (_FINEST * pixel_m)))
         try:
             if path is None:
                 raise PictureError("it is not there")
-            return _soft(read_gray(path, _factor(view, gsd, 0.5 * cell)), view, gsd, 0.5 * cell)
+            picture = read_gray(path, reduction(lens.width, lens.height, max(wanted, 64)))
         except (PictureError, ValueError):
             unread.add(view.image)
             return None
+        sigma = 0.35 * pixel_m / max(gsd * lens.width / picture.shape[1], 1e-6)
+        return picture if sigma < 0.6 else cv2.GaussianBlur(picture, (0, 0), sigma)
 
+    east, north = report.get("map_lean_m_per_m") or (0.0, 0.0)
+    lean = (float(east), float(north))
     scene = ComparedScene(
-        views=flown.views, terrain=terrain, basemap=before, orthoimage=orthoimage, read=read, lean=_lean(report)
+        views=flown.views, terrain=terrain, basemap=before, orthoimage=orthoimage, read=read, lean=lean
     )
     return scene, warnings
-
-
-def _basemap(given: Path | None, report: Mapping[str, Any], epsg: int, orthoimage: Path) -> Basemap:
-    import rasterio
-
-    if given is None and not report.get("basemap"):
-        raise InputError("the map was made without a basemap; give the pre-disaster map with --basemap")
-    with rasterio.open(orthoimage) as file:
-        near = BoundingBox(*file.bounds)
-    return Basemap.open(path_of(str(report["basemap"])) if given is None else given, epsg, near)
-
-
-def _lean(report: Mapping[str, Any]) -> tuple[float, float]:
-    east, north = report.get("map_lean_m_per_m") or (0.0, 0.0)
-    return float(east), float(north)
-
-
-def _factor(view: View, gsd: float, pixel_m: float) -> int:
-    """By how much a picture is reduced while it is decoded."""
-    wanted = round(view.lens.width * min(1.0, gsd / (_FINEST * pixel_m)))
-    return reduction(view.lens.width, view.lens.height, max(wanted, 64))
-
-
-def _soft(picture: Bytes, view: View, gsd: float, pixel_m: float) -> Bytes:
-    """A picture as soft as the pixels on which it is drawn."""
-    sigma = 0.35 * pixel_m / max(gsd * view.lens.width / picture.shape[1], 1e-6)
-    return picture if sigma < 0.6 else cv2.GaussianBlur(picture, (0, 0), sigma)

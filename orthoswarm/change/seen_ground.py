@@ -27,20 +27,14 @@ Read = Callable[[View], Bytes | None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeenGround:
-    """What pictures show of a grid; float32 (rows, columns), 0 where none sees it.
+    """What pictures show of a grid; float32 (rows, columns), 0 where none sees it."""
 
-    Attributes:
-        field: (rows, columns, 4), mean structure. power: mean square of its first two in each picture by itself.
-        gray: mean grey value. contrast: mean contrast. weight: how many pictures count. same: the part of `power` that
-        the pictures have in common: of all where only one counts.
-    """
-
-    field: Floats
-    power: Floats
-    gray: Floats
-    contrast: Floats
-    weight: Floats
-    same: Floats
+    field: Floats  # (rows, columns, 4), mean structure
+    power: Floats  # mean square of its first two in each picture by itself
+    gray: Floats  # mean grey value
+    contrast: Floats  # mean contrast
+    weight: Floats  # how many pictures count
+    same: Floats  # the part of `power` that the pictures have in common: of all where only one counts
 
 
 def heights_on(grid: GroundGrid, terrain: Terrain, of: Floats) -> Floats:

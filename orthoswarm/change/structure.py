@@ -19,14 +19,10 @@ _MOST: Final = 2.0  # of a gradient in contrasts around it: edges of shadows do 
 
 
 class Structure(NamedTuple):
-    """Structure of each pixel, float32 (rows, columns, 4): gradient along columns and rows, and both doubled in angle.
+    """Structure of each pixel."""
 
-    Attributes:
-        field: the four. contrast: float32 (rows, columns), of the surroundings, grey values a pixel.
-    """
-
-    field: Floats
-    contrast: Floats
+    field: Floats  # float32 (rows, columns, 4): gradient along columns and rows, and both doubled in angle
+    contrast: Floats  # float32 (rows, columns), of the surroundings, grey values a pixel
 
     @property
     def power(self) -> Floats:

@@ -25,23 +25,15 @@ _HEIGHT_SIGMA_M: Final = 2.0  # sigma of a point's height over the solved terrai
 
 @dataclass(frozen=True, slots=True)
 class ControlObservation:
-    """A surveyed point in one frame of reference.
+    """A surveyed point in one frame of reference."""
 
-    Attributes:
-        name: of the point.
-        placed: float64 (2,), east and north in the block. surveyed: float64 (2,), east and north by survey; same grid.
-        sigma_m: of the difference, per axis: survey, pointing, and deformation of the block at that point.
-        stated: whether the survey's sigma is known; False where it is assumed.
-        rays: how its marks meet; None for a place on the basemap.
-    """
-
-    name: str
-    placed: Array
-    surveyed: Array
-    sigma_m: float
-    stated: bool = True
+    name: str  # of the point
+    placed: Array  # float64 (2,), east and north in the block
+    surveyed: Array  # float64 (2,), east and north by survey; same grid
+    sigma_m: float  # of the difference, per axis: survey, pointing, and deformation of the block at that point
+    stated: bool = True  # whether the survey's sigma is known; False where it is assumed
     _: KW_ONLY
-    rays: RayPoint | None = None
+    rays: RayPoint | None = None  # how its marks meet; None for a place on the basemap
 
 
 def check_control(
@@ -49,8 +41,7 @@ def check_control(
 ) -> None:
     """Refuse unusable control points before the work begins.
 
-    Raises:
-        InputError: no point is marked in a photo or on the basemap, or one is far from all photos.
+    Raises InputError: no point is marked in a photo or on the basemap, or one is far from all photos.
     """
     images = {p.frame.image: p for p in recorded}
     seen = [p for p in points if (has_map and p.on_map is not None) or _photos(p, images)]
@@ -123,8 +114,7 @@ def on_basemap(points: Iterable[Checkpoint], grid: LocalGrid, map_gsd_m: float) 
 def _photos(point: Checkpoint, images: dict[str, PlacedFrame]) -> list[tuple[PlacedFrame, Array]]:
     """The photos that show a point, and its pixel (2,) in each.
 
-    Raises:
-        InputError: a pixel lies outside its photo, or a name belongs to several photos.
+    Raises InputError: a pixel lies outside its photo, or a name belongs to several photos.
     """
     out = []
     for mark in point.marks:

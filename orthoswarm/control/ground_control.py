@@ -12,8 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from orthoswarm.control.control_observations import in_photos, on_basemap
-from orthoswarm.control.moved_block import moved_camera, moved_terrain
-from orthoswarm.control.similarity import ControlFit, fit_similarity
+from orthoswarm.control.similarity import ControlFit, fit_similarity, moved_camera, moved_terrain
 from orthoswarm.evaluation.checkpoints import RECEIVERS_LOCAL_SIGMA_M, Checkpoint
 from orthoswarm.model.arrays import Array
 from orthoswarm.model.geo import LocalGrid
@@ -75,10 +74,7 @@ def place_on_control(
 ) -> tuple[Refinement, GroundControl]:
     """Move the fine cameras and their terrain onto control points; the given refinement is not modified.
 
-    map_gsd_m: the basemap's pixel, None without a basemap.
-
-    Raises:
-        InputError: a point's pixel lies outside its photo.
+    map_gsd_m: the basemap's pixel, None without a basemap. Raises InputError: a point's pixel lies outside its photo.
     """
     placed = [p for s in refinement.fine for p in s.placed]
     terrain = refinement.terrain or Terrain.flat()
@@ -97,7 +93,8 @@ def place_on_control(
     if not fits:
         return refinement, result
     level = float(np.median(terrain.height(np.array([p.camera.nadir for p in placed]))))
-    base = _smallest_sigma(placed)
+    # The common error of the photos positioned by receivers.
+    base = min((p.sigma_m for p in placed if p.stage != "fine" and np.isfinite(p.sigma_m)), default=0.0)
 
     def moved(p: PlacedFrame) -> PlacedFrame:
         fit = fits.get(p.stage == "fine")
@@ -128,12 +125,6 @@ def _restated(legs: Sequence[Leg], placed: Sequence[PlacedFrame]) -> list[Leg]:
         replace(leg, sigma_m=float(np.median(sigma[leg.first : leg.last + 1]))) if leg.first < len(sigma) else leg
         for leg in legs
     ]
-
-
-def _smallest_sigma(placed: Sequence[PlacedFrame]) -> float:
-    """The common error of the photos positioned by receivers, metres: the smallest of their sigmas."""
-    values = [p.sigma_m for p in placed if p.stage != "fine" and np.isfinite(p.sigma_m)]
-    return min(values, default=0.0)
 
 
 def _moved(placed: PlacedFrame, fit: ControlFit, level_m: float, base_sigma_m: float) -> PlacedFrame:

@@ -13,7 +13,9 @@ import numpy as np
 from orthoswarm.control.control_observations import ControlObservation
 from orthoswarm.evaluation.misread_points import FARTHEST_M
 from orthoswarm.evaluation.point_rays import MISTAKE_PROBABILITY
-from orthoswarm.model.arrays import Array
+from orthoswarm.model.arrays import Array, Floats
+from orthoswarm.model.camera import Camera
+from orthoswarm.model.placement import Terrain
 from orthoswarm.model.plane_similarity import Similarity
 
 _HALVINGS = 20  # of a bracket of a kilometre, to a millimetre
@@ -24,21 +26,14 @@ _SHIFT_SIGMA_M: Final = 100.0  # what is known of the shift before the control p
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlFit:
-    """A similarity and the residuals of the control points.
+    """A similarity and the residuals of the control points."""
 
-    Attributes:
-        similarity: from the block to the ground.
-        used: the observations used. residual: float64 (n, 2), of each of them, block minus survey.
-        left_out: observations rejected as outliers.
-        contradiction: True where the observations disagree, but are too few to find the outlier.
-        scatter_m: how far points whose sigma is not stated scatter more than was assumed, one sigma of an axis.
-    """
-
-    similarity: Similarity
-    used: list[ControlObservation]
-    residual: Array
-    left_out: list[ControlObservation]
-    contradiction: bool
+    similarity: Similarity  # from the block to the ground
+    used: list[ControlObservation]  # the observations used
+    residual: Array  # float64 (n, 2), of each of them, block minus survey
+    left_out: list[ControlObservation]  # observations rejected as outliers
+    contradiction: bool  # True where the observations disagree, but are too few to find the outlier
+    # how far points whose sigma is not stated scatter more than was assumed, one sigma of an axis
     scatter_m: float = 0.0
 
 
@@ -129,3 +124,37 @@ def _left_out_chi2(used: Sequence[ControlObservation], middle: Array, prior_sigm
         variance = o.sigma_m**2 + float(others.sigma_m(o.placed)) ** 2
         out.append(float((away**2).sum()) / variance)
     return np.array(out)
+
+
+def moved_camera(camera: Camera, similarity: Similarity, level_m: float, up_m: float = 0.0) -> Camera:
+    """A camera after a similarity; heights over a level are scaled, too, so that no pixel's ray is bent.
+
+    camera: before it. level_m: of the ground. up_m: added to its height.
+    """
+    height = float(similarity.moved_heights(camera.position[2], level_m)) + up_m
+    position = np.array([*similarity.moved(camera.nadir), height])
+    return replace(camera, position=position, rotation=similarity.about_up @ camera.rotation)
+
+
+def moved_terrain(terrain: Terrain, similarity: Similarity, level_m: float) -> Terrain:
+    """The ground after a similarity, on nodes as far apart as before.
+
+    terrain: before it. level_m: heights over this level are scaled.
+    """
+    rows, columns = terrain.z.shape
+    step = terrain.step_m
+    if rows <= 2 and columns <= 2 and terrain.bare is None and float(np.ptp(terrain.z)) == 0.0:
+        return terrain  # a level plane
+    west, south = terrain.west, terrain.south
+    east, north = west + (columns - 1) * step, south + (rows - 1) * step
+    corners = similarity.moved(np.array([[west, south], [east, south], [east, north], [west, north]]))
+    low = np.floor(corners.min(axis=0) / step) * step
+    count = np.ceil((corners.max(axis=0) - low) / step).astype(int) + 1
+    empty = Terrain(float(low[0]), float(low[1]), step, np.zeros(count[::-1], np.float32))
+    before = similarity.back(empty.nodes())
+
+    def moved(z: Floats) -> Floats:
+        heights = replace(terrain, z=z).height(before)
+        return np.asarray(similarity.moved_heights(heights, level_m), np.float32)
+
+    return terrain.changed(moved, west=float(low[0]), south=float(low[1]))

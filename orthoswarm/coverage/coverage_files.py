@@ -30,8 +30,7 @@ def write_cells(path: Path, cover: CoverageGrid) -> None:
 
     Band 3 is the number of views without a flaw, at most 255.
 
-    Raises:
-        OrthoSwarmError: if the disk is full or the folder cannot be written.
+    Raises OrthoSwarmError: if the disk is full or the folder cannot be written.
     """
     import rasterio
 
@@ -74,8 +73,7 @@ def gap_feature(gap: CoverageGap, grid: LocalGrid) -> dict[str, Any]:
 def write_gaps(folder: Path, gaps: Gaps, grid: LocalGrid) -> None:
     """Write gaps.geojson, gaps.gpkg and gaps.kml.
 
-    Raises:
-        OrthoSwarmError: if the disk is full or the folder cannot be written.
+    Raises OrthoSwarmError: if the disk is full or the folder cannot be written.
     """
     features = [gap_feature(gap, grid) for gap in gaps.gaps]
     rows = [(f["properties"], f["geometry"]["coordinates"]) for f in features]
@@ -128,8 +126,7 @@ def _write_gpkg(path: Path, gaps: Sequence[CoverageGap], rows: Sequence[dict[str
 def draw_cells(path: Path, cover: CoverageGrid, gaps: Gaps, ortho: Path | None = None) -> None:
     """Draw states and outlines of gaps, over an orthoimage if there is one, as a PNG.
 
-    Raises:
-        OrthoSwarmError: if the disk is full or the folder cannot be written.
+    Raises OrthoSwarmError: if the disk is full or the folder cannot be written.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

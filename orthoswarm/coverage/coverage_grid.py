@@ -52,35 +52,25 @@ class CellState(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Demands:
-    """Requirements for ground to count as well seen.
+    """Requirements for ground to count as well seen."""
 
-    Attributes:
-        gsd_m: largest GSD, None for any. sigma_m: largest sigma of a picture's position, None for any.
-    """
-
-    gsd_m: float | None = None
-    sigma_m: float | None = None
+    gsd_m: float | None = None  # largest GSD, None for any
+    sigma_m: float | None = None  # largest sigma of a picture's position, None for any
 
 
 @dataclass(frozen=True, slots=True)
 class Cells:
-    """The cells of an area.
-
-    Attributes:
-        grid: their grid. wanted: bool (rows, columns), cells whose centre is to be mapped. excluded: bool, cells in
-            no-fly zones within the area's outline.
-    """
+    """The cells of an area."""
 
     grid: GroundGrid
-    wanted: Flags
-    excluded: Flags
+    wanted: Flags  # bool (rows, columns), cells whose centre is to be mapped
+    excluded: Flags  # bool, cells in no-fly zones within the area's outline
 
     @classmethod
     def of_area(cls, epsg: int, ground: Geometry, no_fly: Geometry = None, cell_m: float = _CELL_M) -> "Cells":
         """Cells of at most `cell_m` over shapely (Multi)Polygons in the grid of `epsg`.
 
-        Raises:
-            InputError: the area is empty, or would have more than `_MOST_CELLS`.
+        Raises InputError: the area is empty, or would have more than `_MOST_CELLS`.
         """
         from rasterio.features import rasterize
 
@@ -205,7 +195,8 @@ class CoverageGrid:
         if self.demands.sigma_m is not None and sigma > self.demands.sigma_m:
             flaws |= Flaw.POSITION
         coarsest = 0.0 if self.demands.gsd_m is None else self.demands.gsd_m
-        quality = np.array([2.0 * sigma, 2.0 * view.focal_sigma, float(flaws), coarsest, *_descents()])
+        descents = math.cos(math.radians(_OBLIQUE_DEG)), LEAST_DESCENT  # of what is not oblique, and of what is seen
+        quality = np.array([2.0 * sigma, 2.0 * view.focal_sigma, float(flaws), coarsest, *descents])
         ground, heights, corner = self.terrain, self._heights, (0, 0)
         if view.ground is not None:
             ground, heights, corner = view.ground, _heights(view.ground, self.cells.grid, box), (box[0], box[2])
@@ -235,11 +226,6 @@ class CoverageGrid:
             max(0, math.floor((grid.north - north) / s)), min(grid.height, math.ceil((grid.north - south) / s)),
             max(0, math.floor((west - grid.west) / s)), min(grid.width, math.ceil((east - grid.west) / s)),
         )  # fmt: skip
-
-
-def _descents() -> tuple[float, float]:
-    """Cosines of the largest off-nadir angle that is not oblique, and of the largest that sees the ground at all."""
-    return math.cos(math.radians(_OBLIQUE_DEG)), LEAST_DESCENT
 
 
 def _union(boxes: Sequence[Box]) -> Box:

@@ -23,49 +23,33 @@ _BY_IMPORTANCE = (Flaw.DAMAGED, Flaw.BLURRED, Flaw.HAZE, Flaw.POSITION, Flaw.COA
 
 @dataclass(frozen=True, slots=True)
 class PlannedFlight:
-    """The planned flight.
+    """The planned flight."""
 
-    Attributes:
-        legs: float64 (n, 2, 2), first and last ground point of each leg in the grid of the cells, metres.
-        width_m: ground that the narrowest camera sees across a leg; height_m along it.
-        fov_rad: theta-hat, the horizontal field of view that the plan relies on.
-    """
-
-    legs: Array
-    width_m: float
+    legs: Array  # float64 (n, 2, 2), first and last ground point of each leg in the grid of the cells, metres
+    width_m: float  # ground that the narrowest camera sees across a leg; height_m along it
     height_m: float
-    fov_rad: float
+    fov_rad: float  # theta-hat, the horizontal field of view that the plan relies on
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CoverageGap:
-    """A gap.
+    """A gap."""
 
-    Attributes:
-        polygon: shapely Polygon in the grid of the cells. area_m2: its size.
-        cause: why. detail: the flaw, for ground seen poorly; else empty. confidence: of the cause, 0 to 1.
-        vehicle: the vehicle whose pictures are missing or narrow, empty if unknown.
-    """
-
-    polygon: Geometry
-    area_m2: float
+    polygon: Geometry  # shapely Polygon in the grid of the cells
+    area_m2: float  # its size
     cause: Cause
-    detail: str
-    confidence: float
-    vehicle: str = ""
+    detail: str  # the flaw, for ground seen poorly; else empty
+    confidence: float  # of the cause, 0 to 1
+    vehicle: str = ""  # the vehicle whose pictures are missing or narrow, empty if unknown
 
 
 @dataclass(frozen=True, slots=True)
 class Gaps:
-    """All gaps, largest first.
+    """All gaps, largest first."""
 
-    Attributes:
-        gaps: those of at least the smallest size. small: how many smaller ones there are; small_m2: their total size.
-    """
-
-    gaps: list[CoverageGap]
-    small: int
-    small_m2: float
+    gaps: list[CoverageGap]  # those of at least the smallest size
+    small: int  # how many smaller ones there are
+    small_m2: float  # their total size
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,9 +98,12 @@ def find_gaps(
                 )
     if plan is not None:
         for vehicle in vehicles:
-            narrow = [
-                v for v in cover.views if v.vehicle == vehicle and _is_narrow(v.fov_rad, v.focal_sigma, plan.fov_rad)
-            ]
+            planned = math.tan(0.5 * plan.fov_rad)
+            narrow = [  # by more than two sigma, and half a percent
+                v for v in cover.views
+                if v.vehicle == vehicle
+                and math.tan(0.5 * v.fov_rad) < planned * (1.0 - max(0.005, 2.0 * v.focal_sigma))
+            ]  # fmt: skip
             if narrow:
                 wide = _would_see(cover, [v.with_fov(plan.fov_rad) for v in narrow])
                 explained.enter(missed & wide, Cause.NARROW_LENS, 0.9, vehicles.index(vehicle))
@@ -124,12 +111,6 @@ def find_gaps(
         explained.enter(missed, Cause.NOT_PLANNED, 0.9)
     explained.enter(missed, Cause.NOT_FLOWN, 0.5)
     return _polygons(cover, explained, vehicles, _SMALLEST_GAP_M2)
-
-
-def _is_narrow(fov_rad: float, focal_sigma: float, planned_rad: float) -> bool:
-    """Narrower than planned by more than two sigma (and half a percent)."""
-    planned, own = math.tan(0.5 * planned_rad), math.tan(0.5 * fov_rad)
-    return own < planned * (1.0 - max(0.005, 2.0 * focal_sigma))
 
 
 def _would_see(cover: CoverageGrid, views: Sequence[Any]) -> Flags:
@@ -141,8 +122,7 @@ def _would_see(cover: CoverageGrid, views: Sequence[Any]) -> Flags:
 def below_legs(cells: Cells, plan: PlannedFlight, legs: Array) -> Flags:
     """Cells that a plan's pictures of some of its legs would show, bool (rows, columns).
 
-    Args:
-        cells: of the area. plan: with the size of its pictures. legs: float64 (n, 2, 2), ends of legs, grid metres.
+    cells: of the area. plan: with the size of its pictures. legs: float64 (n, 2, 2), ends of legs, grid metres.
     """
     import shapely
     from rasterio.features import rasterize

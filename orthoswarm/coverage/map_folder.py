@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from orthoswarm.coverage.missing_pictures import Exposure
-from orthoswarm.coverage.picture_flaws import picture_flaws
-from orthoswarm.coverage.view import View
+from orthoswarm.coverage.view import View, picture_flaws
 from orthoswarm.export.product_files import read_frames
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
@@ -25,29 +24,18 @@ from orthoswarm.stores.addresses import path_of
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapFolder:
-    """The pictures of a finished map.
+    """The pictures of a finished map."""
 
-    Attributes:
-        epsg: grid of the map. ground_z_m: level of the mapped ground, same datum as the cameras.
-        views: placed pictures. rejected: files that were not placed, with a time.
-        root: folder that names of pictures are relative to, None if the report does not state it.
-        warnings: for the user.
-    """
-
-    epsg: int
-    ground_z_m: float
-    views: list[View]
-    rejected: list[Exposure]
-    root: Path | None
+    epsg: int  # grid of the map
+    ground_z_m: float  # level of the mapped ground, same datum as the cameras
+    views: list[View]  # placed pictures
+    rejected: list[Exposure]  # files that were not placed, with a time
+    root: Path | None  # folder that names of pictures are relative to, None if the report does not state it
     warnings: list[str]
 
 
 def read_map(folder: Path) -> MapFolder:
-    """Read a map's pictures.
-
-    Raises:
-        InputError: there is no frames.jsonl or report.json, or they cannot be used.
-    """
+    """Read a map's pictures. Raises InputError: there is no frames.jsonl or report.json, or they cannot be used."""
     report, rows = _documents(folder)
     placed = [row for row in rows if row.get("stage") != "rejected"]
     if not placed:
@@ -107,8 +95,7 @@ def with_flaws(
 ) -> tuple[list[View], int]:
     """The views with the flaws of their pictures, which are decoded for it; and how many could not be read.
 
-    Args:
-        views: placed pictures. root: folder that their names are relative to. progress: called with done and total.
+    views: placed pictures. root: folder that their names are relative to. progress: called with done and total.
     """
 
     def measured(view: View) -> PictureQuality | None:

@@ -40,30 +40,21 @@ class Cause(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """A camera event recorded by the vehicle, or a picture file that could not be used.
-
-    Attributes:
-        vehicle: its id. time_s: UTC epoch seconds. image: name of the file, empty for an event without one.
-    """
+    """A camera event recorded by the vehicle, or a picture file that could not be used."""
 
     vehicle: str
-    time_s: float
-    image: str = ""
+    time_s: float  # UTC epoch seconds
+    image: str = ""  # name of the file, empty for an event without one
 
 
 @dataclass(frozen=True, slots=True)
 class MissingPicture:
-    """A missing picture.
+    """A missing picture."""
 
-    Attributes:
-        view: its expected camera; its image is the name of the file where that is known.
-        after: name of the picture before the hole. cause: why it is missing. confidence: 0 to 1.
-    """
-
-    view: View
-    after: str
-    cause: Cause
-    confidence: float
+    view: View  # its expected camera; its image is the name of the file where that is known
+    after: str  # name of the picture before the hole
+    cause: Cause  # why it is missing
+    confidence: float  # 0 to 1
 
 
 def missing_pictures(views: Sequence[View], exposures: Iterable[Exposure] = ()) -> list[MissingPicture]:
@@ -74,8 +65,7 @@ def missing_pictures(views: Sequence[View], exposures: Iterable[Exposure] = ()) 
     have not arrived. Without recorded exposures the numbers in file names decide: skipped numbers mean pictures that
     have not arrived, consecutive ones that the camera was not triggered.
 
-    Args:
-        views: pictures that were placed. exposures: of any vehicle, in any order, also of pictures that are in `views`.
+    views: pictures that were placed. exposures: of any vehicle, in any order, also of pictures that are in `views`.
     """
     known = {(v.vehicle, v.image) for v in views}
     lost: dict[str, list[Exposure]] = defaultdict(list)
@@ -143,40 +133,24 @@ def _number(image: str) -> int | None:
 
 @dataclass(frozen=True, slots=True)
 class CameraEvent:
-    """An exposure as a vehicle reported it.
-
-    Attributes:
-        vehicle: its id. number: as counted by the vehicle. time_s: UTC epoch seconds.
-        position: float64 (3,), east, north in the grid of the views, and a height that is not used (vehicles count it
-            from another level than maps do); None where the event has none.
-    """
+    """An exposure as a vehicle reported it."""
 
     vehicle: str
-    number: int
-    time_s: float
+    number: int  # as counted by the vehicle
+    time_s: float  # UTC epoch seconds
+    # float64 (3,), east, north in the grid of the views, and a height that is not used (vehicles count it from another
+    # level than maps do); None where the event has none
     position: Array | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Missing:
-    """Missing pictures.
-
-    Attributes:
-        pictures: missing pictures; those that have not arrived are named by their event's number.
-        warnings: reasons why events could not be used.
-    """
-
-    pictures: list[MissingPicture]
-    warnings: list[str]
 
 
 def missing_by_events(
     views: Sequence[View], events: Iterable[CameraEvent], rejected: Iterable[Exposure] = ()
-) -> Missing:
+) -> tuple[list[MissingPicture], list[str]]:
     """Missing pictures of all vehicles; for vehicles without events only from holes in their legs.
 
-    Args:
-        views: pictures that were placed. events: in any order. rejected: files that could not be used.
+    views: pictures that were placed. events: in any order. rejected: files that could not be used.
+
+    Returns the pictures, those that have not arrived named by their event's number, and why events could not be used.
     """
     lost = list(rejected)
     by_vehicle: dict[str, list[CameraEvent]] = defaultdict(list)
@@ -208,7 +182,7 @@ def missing_by_events(
         ]
     for vehicle in sorted(set(by_vehicle) - set(rows)):
         found += _none_arrived(vehicle, by_vehicle[vehicle], views)
-    return Missing(found, warnings)
+    return found, warnings
 
 
 def _none_arrived(vehicle: str, events: Sequence[CameraEvent], views: Sequence[View]) -> list[MissingPicture]:

@@ -4,8 +4,7 @@ import numpy as np
 
 from orthoswarm.compute.jit import in_place_kernel
 
-UNSEEN = 255
-"""Value of `best` in a cell that no picture sees."""
+UNSEEN = 255  # value of `best` in a cell that no picture sees
 _EDGE, _OBLIQUE, _COARSE = 1, 2, 64
 
 
@@ -29,8 +28,7 @@ def paint(best, good, height, level, box, edges, camera, position, lens, quality
         height: float32, ground at the cells from `box[4]`, `box[5]` on; (1, 1) for level ground.
         level: the ground's height if it is level.
         box: first row, row behind the last, first column, column behind the last, of the cells; row and column of the
-            cell to which the first element of `height` belongs.
-        edges: west, north of the grid, side of a cell, metres.
+            cell to which the first element of `height` belongs. edges: west, north of the grid, side of a cell, metres.
         camera: float64 (3, 3), View.to_camera. position: float64 (3,).
         lens: focal length in pixels, k1, k2, k3, principal point (2), columns, rows, largest undistorted radius.
         quality: two sigma in metres, two sigma of the focal length (relative), flaws of the picture, coarsest ground

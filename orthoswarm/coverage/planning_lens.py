@@ -11,7 +11,6 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.coverage.view import View
 from orthoswarm.model.robust import mad_sigma
@@ -63,7 +62,8 @@ def _effective(views: Sequence[View], ground_z_m: float, heights_over_level_grou
     recorded = np.array([np.nan if v.recorded_height_m is None else v.recorded_height_m for v in views])
     known = recorded > 0.0
     if heights_over_level_ground and known.any():
-        above = np.array([_above_ground_m(v, ground_z_m) for v in views])
+        below = [ground_z_m if v.ground is None else v.ground.bare_ground().height(v.position[:2]) for v in views]
+        above = np.array([float(v.position[2] - z) for v, z in zip(views, below, strict=True)])
         half_width = half_width[known] * above[known] / recorded[known]
         middle = float(np.median(half_width))
         sigma = mad_sigma(half_width - middle)
@@ -71,10 +71,3 @@ def _effective(views: Sequence[View], ground_z_m: float, heights_over_level_grou
         middle = float(np.median(half_width))
         sigma = middle * float(np.median([v.focal_sigma for v in views]))
     return 2.0 * math.atan(max(middle - _LENS_SIGMAS * sigma, 0.0))
-
-
-def _above_ground_m(view: View, ground_z_m: float) -> float:
-    below: float | NDArray[np.float64] = ground_z_m
-    if view.ground is not None:
-        below = view.ground.bare_ground().height(view.position[:2])
-    return float(view.position[2] - below)

@@ -16,7 +16,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 
@@ -29,10 +29,8 @@ from orthoswarm.model.coordinate_system import to_degrees
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
 
-STANDARD_COUNT = 30
-"""Checkpoints that a statement by the standard needs at least."""
-_SAME_PLACE_M = 0.02
-"""Lines of one point may round its coordinates differently."""
+STANDARD_COUNT = 30  # checkpoints that a statement by the standard needs at least
+_SAME_PLACE_M = 0.02  # lines of one point may round its coordinates differently
 _DECIMAL_COMMA = re.compile(r"^([-+]?\d+),(\d+)$")
 
 SURVEY_SIGMA_M: Final = 0.05
@@ -47,18 +45,6 @@ _ONE_PLACE_M: Final = 0.05  # checkpoint within this distance of a control point
 _SAME_NAME_M: Final = 10.0  # ... and within this one if it has its name
 
 
-class Surveyed(Protocol):
-    """A point with its name and its place: longitude and latitude in degrees."""
-
-    @property
-    def name(self) -> str:
-        """Name of the point."""
-
-    @property
-    def surveyed(self) -> Any:
-        """Longitude and latitude (2,)."""
-
-
 @dataclass(frozen=True, slots=True)
 class Mark:
     """A point seen in a photo: column and row, pixel centres at integers, in pixels of the photo as it was mapped."""
@@ -68,11 +54,7 @@ class Mark:
     row: float
 
     def check_inside(self, width: int, height: int) -> None:
-        """Refuse a mark outside its photo.
-
-        Raises:
-            InputError: it lies more than a pixel outside.
-        """
+        """Refuse a mark outside its photo. Raises InputError: it lies more than a pixel outside."""
         if not (-1.0 <= self.column <= width and -1.0 <= self.row <= height):
             raise InputError(
                 f"{self.image} has {width} x {height} pixels, a point is marked at {self.column:.0f}, {self.row:.0f}; "
@@ -82,50 +64,34 @@ class Mark:
 
 @dataclass(slots=True)
 class Checkpoint:
-    """A surveyed point.
+    """A surveyed point."""
 
-    Attributes:
-        name: of the point. surveyed: float64 (2,), longitude and latitude (WGS 84).
-        sigma_m: of the survey, an axis; 0 where it is not stated.
-        marks: where photos show it. on_map: longitude and latitude at which the orthoimage shows it.
-        written: its coordinates as the table has them. doubt: what is uncertain about their datum, "" if nothing is.
-    """
-
-    name: str
-    surveyed: Array
-    sigma_m: float = 0.0
-    marks: list[Mark] = field(default_factory=list)
-    on_map: Array | None = None
+    name: str  # of the point
+    surveyed: Array  # float64 (2,), longitude and latitude (WGS 84)
+    sigma_m: float = 0.0  # of the survey, an axis; 0 where it is not stated
+    marks: list[Mark] = field(default_factory=list)  # where photos show it
+    on_map: Array | None = None  # longitude and latitude at which the orthoimage shows it
     _: KW_ONLY
-    written: Coordinates | None = None
-    doubt: str = ""
+    written: Coordinates | None = None  # its coordinates as the table has them
+    doubt: str = ""  # what is uncertain about their datum, "" if nothing is
 
 
 @dataclass(frozen=True, slots=True)
 class CheckpointAccuracy:
-    """What the checkpoints say.
+    """What the checkpoints say."""
 
-    Attributes:
-        names: of the points that could be measured.
-        error: float64 (n, 2), map minus survey, east and north, metres.
-        survey_m: root mean square of the survey's own horizontal error, metres.
-        unused: names of the points that no mapped photo shows, and of those that lie elsewhere.
-        how: `photos`, `orthoimage` or both.
-        control: names of the points that were left out because they had placed the map.
-        findings: marks that contradict each other, points that cannot be where they are said to be, and what is
-            uncertain about their datum, in plain words.
-        miss_m: root mean square by which the rays of each point miss it, metres; None where it was measured on the
-            orthoimage.
-    """
-
-    names: list[str]
-    error: Array
-    survey_m: float
-    unused: list[str]
-    how: str
+    names: list[str]  # of the points that could be measured
+    error: Array  # float64 (n, 2), map minus survey, east and north, metres
+    survey_m: float  # root mean square of the survey's own horizontal error, metres
+    unused: list[str]  # names of the points that no mapped photo shows, and of those that lie elsewhere
+    how: str  # `photos`, `orthoimage` or both
     _: KW_ONLY
+    # names of the points that were left out because they had placed the map
     control: list[str] = field(default_factory=list)
+    # marks that contradict each other, points that cannot be where they are said to be, and what is uncertain about
+    # their datum, in plain words
     findings: list[str] = field(default_factory=list)
+    # root mean square by which the rays of each point miss it, metres; None where it was measured on the orthoimage
     miss_m: list[float | None] = field(default_factory=list)
 
     @property
@@ -174,13 +140,9 @@ class CheckpointAccuracy:
 
 
 def evaluate_checkpoints(
-    out: Path,
-    table: Path,
-    pixel_scale: float = 1.0,
-    ground_z_m: float | None = None,
-    *,
-    control: Sequence[Surveyed] | None = None,
-) -> CheckpointAccuracy:
+    out: Path, table: Path, pixel_scale: float = 1.0, ground_z_m: float | None = None, *,
+    control: Sequence[Checkpoint] | None = None,
+) -> CheckpointAccuracy:  # fmt: skip
     """Errors of a product at surveyed points.
 
     Args:
@@ -198,7 +160,8 @@ def evaluate_checkpoints(
     shared = shared_points(every, _control_of(folder) if control is None else control, table.name)
     points = [point for point in every if point.name not in shared]
     views = _Views.read(folder, ground_z_m) if any(p.marks for p in points) else None
-    grid = LocalGrid(views.epsg if views else _epsg(points))
+    lat_lon = [(p.surveyed if p.on_map is None else p.on_map)[::-1] for p in points]
+    grid = LocalGrid(views.epsg if views else area_epsg(*np.array(lat_lon, float).T))
     names, errors, sigmas, unused, how = [], [], [], [], set()
     findings = list(dict.fromkeys(f"points: {point.doubt}" for point in points if point.doubt))
     misses: list[float | None] = []
@@ -240,21 +203,17 @@ def evaluate_checkpoints(
     )
 
 
-def _control_of(folder: Path) -> Sequence[Surveyed]:
+def _control_of(folder: Path) -> Sequence[Checkpoint]:
     """The control points of a map; none where it has no report that can be read (see _Views.read for its message)."""
     try:
-        report = json.loads((folder / "report.json").read_text("utf-8"))
-        return control_of_report(report.get("control_points") or [])
+        rows = json.loads((folder / "report.json").read_text("utf-8")).get("control_points") or []
+        return [Checkpoint(str(row["name"]), np.array([row["lon_deg"], row["lat_deg"]], float)) for row in rows]
     except (OSError, ValueError, AttributeError, KeyError, TypeError):
         return []
 
 
 def read_checkpoints(table: Path, pixel_scale: float = 1.0) -> list[Checkpoint]:
-    """The points of a table, see the module.
-
-    Raises:
-        InputError: if it cannot be read, with the line.
-    """
+    """The points of a table, see the module. Raises InputError: if it cannot be read, with the line."""
     try:
         lines = table.read_text("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -262,28 +221,22 @@ def read_checkpoints(table: Path, pixel_scale: float = 1.0) -> list[Checkpoint]:
     lines = [line for line in lines if line.strip() and not line.startswith("#")]
     if not lines:
         raise InputError(f"{table.name} holds no points")
-    scaled = _Scale(pixel_scale)
     separator = max(";,", key=lines[0].count)
     if separator not in lines[0]:
-        points = _gcp_list(lines, table.name, scaled)
+        points = _gcp_list(lines, table.name, pixel_scale)
     else:
-        points = _csv(lines, table.name, scaled, separator)
+        points = _csv(lines, table.name, pixel_scale, separator)
     if not points:
         raise InputError(f"{table.name} holds no points below its first line")
     return points
 
 
-@dataclass(frozen=True, slots=True)
-class _Scale:
-    """From pixels of the photos in which points were measured to those of the mapped photos."""
-
-    factor: float
-
-    def mark(self, image: str, column: float, row: float) -> Mark:
-        return Mark(image, (column + 0.5) * self.factor - 0.5, (row + 0.5) * self.factor - 0.5)
+def _mark(scale: float, image: str, column: float, row: float) -> Mark:
+    """A mark in the mapped photo; scale: its pixels to one of the photo in which the point was measured."""
+    return Mark(image, (column + 0.5) * scale - 0.5, (row + 0.5) * scale - 0.5)
 
 
-def _gcp_list(lines: Sequence[str], name: str, scale: _Scale) -> list[Checkpoint]:
+def _gcp_list(lines: Sequence[str], name: str, scale: float) -> list[Checkpoint]:
     """ODM's gcp_list.txt; lines with the same coordinates, and name if there are names, are one point."""
     system = lines[0].strip()
     points: list[Checkpoint] = []
@@ -298,23 +251,35 @@ def _gcp_list(lines: Sequence[str], name: str, scale: _Scale) -> list[Checkpoint
         key = words[6] if len(words) > 6 else f"{words[0]} {words[1]}"
         written = Coordinates(east, north, system)
         place, doubt = _in_degrees(written, name)
-        point = Checkpoint(key, place, written=written, doubt=doubt)
-        point.marks.append(scale.mark(image, column, row))
-        points.append(point)
+        marks = [_mark(scale, image, column, row)]
+        points.append(Checkpoint(key, place, marks=marks, written=written, doubt=doubt))
     return _merged(points)
 
 
-def _csv(lines: Sequence[str], name: str, scale: _Scale, separator: str) -> list[Checkpoint]:
+def _csv(lines: Sequence[str], name: str, scale: float, separator: str) -> list[Checkpoint]:
     points: list[Checkpoint] = []
     for number, row in enumerate(csv.DictReader(lines, skipinitialspace=True, delimiter=separator), 2):
         cells = {(key or "").strip().lower(): (value or "").strip() for key, value in row.items() if key is not None}
         if separator == ";":  # spreadsheets in many countries write decimal commas then
             cells = {key: _DECIMAL_COMMA.sub(r"\1.\2", value) for key, value in cells.items()}
         try:
-            point = _csv_row(cells, name, scale)
+            written = _coordinates(cells, "")
+            if written is None:
+                raise KeyError("it has no coordinates")
+            sigma_m = _number(cells.get("sigma_m") or "0")
+            if sigma_m < 0.0:
+                raise ValueError(f"sigma_m is {sigma_m:g}, but cannot be less than 0")
+            surveyed, doubt = _in_degrees(written, name)
+            shown = _coordinates(cells, "map_")
+            on_map = None if shown is None else _in_degrees(shown, name)[0]
+            title = cells.get("name") or f"{surveyed[1]:.7f} {surveyed[0]:.7f}"
+            point = Checkpoint(title, surveyed, sigma_m, on_map=on_map, written=written, doubt=doubt)
+            if cells.get("image"):
+                point.marks.append(_mark(scale, cells["image"], _number(cells["column"]), _number(cells["row"])))
         except (KeyError, ValueError) as error:
+            reason = f"column {error} is missing" if isinstance(error, KeyError) else str(error)
             raise InputError(
-                f"{name}, line {number}: {_reason(error)}; columns are name, lat_deg, lon_deg (or east_m, north_m, "
+                f"{name}, line {number}: {reason}; columns are name, lat_deg, lon_deg (or east_m, north_m, "
                 "epsg), sigma_m, and image, column, row (or map_lat_deg, map_lon_deg)"
             ) from None
         points.append(point)
@@ -343,23 +308,6 @@ def _merged(lines: Iterable[Checkpoint]) -> list[Checkpoint]:
     return points
 
 
-def _csv_row(cells: Mapping[str, str], name: str, scale: _Scale) -> Checkpoint:
-    written = _coordinates(cells, "")
-    if written is None:
-        raise KeyError("it has no coordinates")
-    sigma_m = _number(cells.get("sigma_m") or "0")
-    if sigma_m < 0.0:
-        raise ValueError(f"sigma_m is {sigma_m:g}, but cannot be less than 0")
-    surveyed, doubt = _in_degrees(written, name)
-    shown = _coordinates(cells, "map_")
-    on_map = None if shown is None else _in_degrees(shown, name)[0]
-    title = cells.get("name") or f"{surveyed[1]:.7f} {surveyed[0]:.7f}"
-    point = Checkpoint(title, surveyed, sigma_m, on_map=on_map, written=written, doubt=doubt)
-    if cells.get("image"):
-        point.marks.append(scale.mark(cells["image"], _number(cells["column"]), _number(cells["row"])))
-    return point
-
-
 def _coordinates(cells: Mapping[str, str], prefix: str) -> Coordinates | None:
     """A place by a row's columns with a prefix; None where they are not there."""
     if cells.get(f"{prefix}lat_deg") and cells.get(f"{prefix}lon_deg"):
@@ -368,10 +316,6 @@ def _coordinates(cells: Mapping[str, str], prefix: str) -> Coordinates | None:
         system = f"EPSG:{int(cells['epsg'])}"
         return Coordinates(_number(cells[f"{prefix}east_m"]), _number(cells[f"{prefix}north_m"]), system)
     return None
-
-
-def _reason(error: Exception) -> str:
-    return f"column {error} is missing" if isinstance(error, KeyError) else str(error)
 
 
 def _number(text: str) -> float:
@@ -393,22 +337,13 @@ def _placed(grid: LocalGrid, lon_lat: Array) -> Array:
     return grid.to_grid(lon_lat[1], lon_lat[0])
 
 
-def _epsg(points: Iterable[Checkpoint]) -> int:
-    at = [p.surveyed if p.on_map is None else p.on_map for p in points]
-    return area_epsg([float(p[1]) for p in at], [float(p[0]) for p in at])
-
-
 @dataclass(frozen=True, slots=True)
 class _Views:
-    """The mapped photos of a product, by name.
+    """The mapped photos of a product, by name."""
 
-    Attributes:
-        rows: lines of frames.jsonl by image. epsg: their grid. ground_z_m: level of their homographies.
-    """
-
-    rows: dict[str, dict[str, Any]]
+    rows: dict[str, dict[str, Any]]  # lines of frames.jsonl by image
     epsg: int
-    ground_z_m: float
+    ground_z_m: float  # level of their homographies
 
     @classmethod
     def read(cls, folder: Path, ground_z_m: float | None) -> "_Views":
@@ -457,15 +392,7 @@ class _Views:
         return Ray(row["image"], position, away / np.linalg.norm(away), pixel_rad, float(own or 0.0))
 
 
-@dataclass(frozen=True, slots=True)
-class KnownPoint:
-    """A surveyed point as a report holds it."""
-
-    name: str
-    surveyed: tuple[float, float]
-
-
-def control_rows(points: Iterable[Surveyed]) -> list[dict[str, Any]]:
+def control_rows(points: Iterable[Checkpoint]) -> list[dict[str, Any]]:
     """`control_points` of report.json."""
     return [
         {"name": point.name, "lat_deg": float(point.surveyed[1]), "lon_deg": float(point.surveyed[0])}
@@ -473,23 +400,17 @@ def control_rows(points: Iterable[Surveyed]) -> list[dict[str, Any]]:
     ]
 
 
-def control_of_report(rows: Iterable[dict[str, Any]]) -> list[KnownPoint]:
-    """The points of such rows."""
-    return [KnownPoint(str(row["name"]), (float(row["lon_deg"]), float(row["lat_deg"]))) for row in rows]
-
-
-def shared_points(checkpoints: Sequence[Surveyed], control: Sequence[Surveyed], table: str) -> list[str]:
+def shared_points(checkpoints: Sequence[Checkpoint], control: Sequence[Checkpoint], table: str) -> list[str]:
     """Names of the checkpoints that are control points: at the same place, or near by with the same name.
 
-    A name alone does not tell: many a table counts its points from 1.
-
-    Args:
-        checkpoints: those of a table. control: the points that placed the map. table: its name, for the message.
-
-    Raises:
-        InputError: all of them are.
+    A name alone does not tell: many a table counts its points from 1. Raises InputError: all of the `table` are.
     """
-    shared = [point.name for point in checkpoints if any(_same(point, other) for other in control)]
+
+    def same(point: Checkpoint, other: Checkpoint) -> bool:
+        away = away_m(point.surveyed, other.surveyed)
+        return away <= (_SAME_NAME_M if point.name == other.name else _ONE_PLACE_M)
+
+    shared = [point.name for point in checkpoints if any(same(point, other) for other in control)]
     if checkpoints and len(shared) == len(checkpoints):
         raise InputError(
             f"all points of {table} are control points, which tell nothing about the map's error; keep some points out "
@@ -507,8 +428,3 @@ def shared_warning(shared: Sequence[str], count: int) -> list[str]:
         f"{len(shared)} of {count} checkpoints were left out, as they are control points ({names}): the map was placed "
         "on them"
     ]
-
-
-def _same(point: Surveyed, other: Surveyed) -> bool:
-    away = away_m(np.asarray(point.surveyed), np.asarray(other.surveyed))
-    return away <= (_SAME_NAME_M if point.name == other.name else _ONE_PLACE_M)

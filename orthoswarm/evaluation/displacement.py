@@ -20,43 +20,28 @@ Mask = Flags
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FieldSettings:
-    """How displacements are measured.
+    """How displacements are measured."""
 
-    Attributes:
-        gsd_m: pixel of the grid on which both pictures are compared.
-        block_m: side of a block. step_m: distance of blocks.
-        search_m: largest displacement that is looked for, each way.
-        min_peak: least correlation of a match. max_second: largest second peak, as a share of the first.
-        apart_m: a peak farther away than this is another one.
-        min_cover: least share of a block that both pictures must cover.
-    """
-
-    gsd_m: float = 0.3
-    block_m: float = 36.0
-    step_m: float = 20.0
-    search_m: float = 8.0
-    min_peak: float = 0.25
-    max_second: float = 0.8
-    apart_m: float = 2.0
-    min_cover: float = 0.6
+    gsd_m: float = 0.3  # pixel of the grid on which both pictures are compared
+    block_m: float = 36.0  # side of a block
+    step_m: float = 20.0  # distance of blocks
+    search_m: float = 8.0  # largest displacement that is looked for, each way
+    min_peak: float = 0.25  # least correlation of a match
+    max_second: float = 0.8  # largest second peak, as a share of the first
+    apart_m: float = 2.0  # a peak farther away than this is another one
+    min_cover: float = 0.6  # least share of a block that both pictures must cover
 
 
 @dataclass(frozen=True, slots=True)
 class Displacements:
-    """A field of displacements of an orthoimage against a reference.
+    """A field of displacements of an orthoimage against a reference."""
 
-    Attributes:
-        position: float64 (N, 2), column and row of the blocks' centres on the common grid.
-        shift_m: float64 (N, 2), where the orthoimage has it minus where the reference has it: east, north, metres;
-            NaN where unmatched.
-        peak: float64 (N,), height of the correlation's peak.
-        contrast: float64 (N,), strength of the orthoimage's gradients as a share of the reference's.
-    """
-
-    position: Array
+    position: Array  # float64 (N, 2), column and row of the blocks' centres on the common grid
+    # float64 (N, 2), where the orthoimage has it minus where the reference has it: east, north, metres; NaN where
+    # unmatched
     shift_m: Array
-    peak: Array
-    contrast: Array
+    peak: Array  # float64 (N,), height of the correlation's peak
+    contrast: Array  # float64 (N,), strength of the orthoimage's gradients as a share of the reference's
 
     @property
     def matched(self) -> Mask:
@@ -82,8 +67,7 @@ def gradient_field(gray: Floats, valid: Mask) -> tuple[NDArray[np.complex64], Fl
     """Gradients east + i south, zero where invalid, and their squared length before normalisation.
 
     Args:
-        gray: float32 (rows, columns).
-        valid: bool of the same shape.
+        gray: float32 (rows, columns). valid: bool of the same shape.
 
     Returns:
         complex64 of the same shape, normalised by |g| + the median |g| of valid pixels; float32 |g|^2.
@@ -157,11 +141,8 @@ def displacement_field(
 
     Args:
         ortho: float32 (rows, columns), grey; either as large as the reference or larger by the search radius in
-            pixels on every side.
-        ortho_valid: where it shows ground.
-        reference: float32 (rows, columns), grey.
-        reference_valid: where it may be compared.
-        settings: how to measure.
+            pixels on every side. ortho_valid: where it shows ground. reference: float32 (rows, columns), grey.
+        reference_valid: where it may be compared. settings: how to measure.
         offset: row and column of the reference's first pixel on a larger grid.
 
     Returns:
@@ -199,61 +180,35 @@ def displacement_field(
     return Displacements(table[:, :2], table[:, 2:4], table[:, 4], table[:, 5])
 
 
-@dataclass(frozen=True, slots=True)
-class Completeness:
-    """What share of the ground an orthoimage covers.
-
-    Attributes:
-        share: covered share of the reference's valid ground within the convex hull of the orthoimage's coverage.
-        area_m2: ground that the orthoimage covers.
-    """
-
-    share: float
-    area_m2: float
-
-
-def completeness(ortho_valid: Mask, reference_valid: Mask, gsd_m: float) -> Completeness:
+def completeness(ortho_valid: Mask, reference_valid: Mask) -> float:
     """Covered share of the reference's valid ground inside the hull of the orthoimage's own coverage."""
     import cv2
 
     points = cv2.findNonZero(ortho_valid.astype(np.uint8))
     if points is None:
-        return Completeness(0.0, 0.0)
+        return 0.0
     hull = np.zeros(ortho_valid.shape, np.uint8)
     cv2.fillConvexPoly(hull, cv2.convexHull(points), 1)
     ground = (hull > 0) & reference_valid
-    covered = float((ground & ortho_valid).sum())
-    return Completeness(covered / max(float(ground.sum()), 1.0), float(ortho_valid.sum()) * gsd_m**2)
+    return float((ground & ortho_valid).sum()) / max(float(ground.sum()), 1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Accuracy:
-    """The figures of an orthoimage against a reference; lengths in metres.
+    """The figures of an orthoimage against a reference; lengths in metres."""
 
-    Attributes:
-        median_m: median displacement of the matched blocks.
-        p90_m: 90 % of them are below; p95_m: 95 %; max_m: the largest.
-        mean_east_m: mean shift east; mean_north_m: north.
-        unmatched_share: share of the covered blocks that found no place.
-        share_within_1m: share of all covered blocks, unmatched ones included, that lie within a metre.
-        blocks: covered blocks.
-        completeness: covered share of the ground within the coverage's hull.
-        sharpness: strength of gradients as a share of the reference's, median.
-        seam_p95_m: 95 % of the jumps between neighbouring blocks are below.
-    """
-
-    median_m: float
-    p90_m: float
-    p95_m: float
-    max_m: float
-    mean_east_m: float
-    mean_north_m: float
-    unmatched_share: float
-    share_within_1m: float
-    blocks: int
-    completeness: float
-    sharpness: float
-    seam_p95_m: float
+    median_m: float  # median displacement of the matched blocks
+    p90_m: float  # 90 % of them are below
+    p95_m: float  # 95 %
+    max_m: float  # the largest
+    mean_east_m: float  # mean shift east
+    mean_north_m: float  # north
+    unmatched_share: float  # share of the covered blocks that found no place
+    share_within_1m: float  # share of all covered blocks, unmatched ones included, that lie within a metre
+    blocks: int  # covered blocks
+    completeness: float  # covered share of the ground within the coverage's hull
+    sharpness: float  # strength of gradients as a share of the reference's, median
+    seam_p95_m: float  # 95 % of the jumps between neighbouring blocks are below
     field: Displacements = field(repr=False, compare=False)
 
     def figures(self) -> dict[str, float | int | None]:
@@ -263,51 +218,23 @@ class Accuracy:
         return {n: (None if isinstance(v, float) and not np.isfinite(v) else v) for n, v in values.items()}
 
 
-def accuracy(displacements: Displacements, cover: Completeness, step_px: float) -> Accuracy:
-    """The figures of a field of displacements.
+def accuracy(displacements: Displacements, complete: float, step_px: float) -> Accuracy:
+    """The figures of a field of displacements of all covered blocks; step_px: distance of neighbouring blocks.
 
-    Args:
-        displacements: of all covered blocks.
-        cover: completeness.
-        step_px: distance of neighbouring blocks in pixels of the positions.
+    Where no block is matched, displacements are NaN.
     """
     length, matched = displacements.length_m, displacements.matched
-    count = len(matched)
-    nan = float("nan")
-    if not len(length):
-        return Accuracy(
-            median_m=nan,
-            p90_m=nan,
-            p95_m=nan,
-            max_m=nan,
-            mean_east_m=nan,
-            mean_north_m=nan,
-            unmatched_share=1.0,
-            share_within_1m=0.0,
-            blocks=count,
-            completeness=cover.share,
-            sharpness=nan,
-            seam_p95_m=nan,
-            field=displacements,
-        )
-    p50, p90, p95 = (float(x) for x in np.percentile(length, [50, 90, 95]))
-    east, north = (float(x) for x in displacements.shift_m[matched].mean(0))
+    count, found = len(matched), len(length) > 0
+    east, north = displacements.shift_m[matched].mean(0).tolist() if found else (np.nan, np.nan)
+    p50, p90, p95, most = np.percentile(length, [50, 90, 95, 100]).tolist() if found else [np.nan] * 4
     jumps = np.array(list(_jumps(displacements, step_px)))
     return Accuracy(
-        median_m=p50,
-        p90_m=p90,
-        p95_m=p95,
-        max_m=float(length.max()),
-        mean_east_m=east,
-        mean_north_m=north,
-        unmatched_share=1.0 - len(length) / count,
-        share_within_1m=float((length <= 1.0).sum()) / count,
-        blocks=count,
-        completeness=cover.share,
-        sharpness=float(np.median(displacements.contrast[matched])),
-        seam_p95_m=float(np.percentile(jumps, 95)) if len(jumps) else nan,
-        field=displacements,
-    )
+        median_m=p50, p90_m=p90, p95_m=p95, max_m=most, mean_east_m=east, mean_north_m=north,
+        unmatched_share=1.0 - len(length) / count if found else 1.0,
+        share_within_1m=float((length <= 1.0).sum()) / max(count, 1), blocks=count, completeness=complete,
+        sharpness=float(np.median(displacements.contrast[matched])) if found else np.nan,
+        seam_p95_m=float(np.percentile(jumps, 95)) if len(jumps) else np.nan, field=displacements,
+    )  # fmt: skip
 
 
 def _jumps(d: Displacements, step_px: float) -> Iterator[float]:

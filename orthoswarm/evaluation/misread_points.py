@@ -38,8 +38,7 @@ def is_place(lon_lat: Array) -> bool:
 def require_places(points: Iterable[tuple[str, Array]]) -> None:
     """Refuse points, each a name with longitude and latitude (2,), of which one is at no place of the Earth.
 
-    Raises:
-        InputError: with their names.
+    Raises InputError: with their names.
     """
     names = [name for name, lon_lat in points if not is_place(lon_lat)]
     if names:
@@ -56,8 +55,7 @@ def away_m(surveyed: Array, seen: Array) -> float:
 def meaning(written: Coordinates, seen: Array) -> str:
     """What a table must have meant for its point to lie where it is seen, in words; "" if nothing fits.
 
-    Args:
-        written: coordinates of a point. seen: longitude and latitude (2,) of where it is seen.
+    written: coordinates of a point. seen: longitude and latitude (2,) of where it is seen.
     """
     x, y = written.x, written.y
     orders = {
@@ -80,8 +78,7 @@ def meaning(written: Coordinates, seen: Array) -> str:
 def misplaced(points: Sequence[tuple[str, Coordinates | None, Array, Array]]) -> str:
     """One sentence, without its end, about points that lie elsewhere.
 
-    Args:
-        points: name, coordinates as written, surveyed and seen longitude and latitude (2,) of each.
+    points: name, coordinates as written, surveyed and seen longitude and latitude (2,) of each.
     """
     names = ", ".join(name for name, *_ in points[:_SHOWN_NAMES]) + (", ..." if len(points) > _SHOWN_NAMES else "")
     away = [away_m(surveyed, seen) for _, _, surveyed, seen in points]
@@ -98,8 +95,7 @@ def misplaced(points: Sequence[tuple[str, Coordinates | None, Array, Array]]) ->
 def doubts(names: Sequence[str], error: Array) -> list[str]:
     """Findings on errors that neither a map nor receivers have, in plain words.
 
-    Args:
-        names: of the points. error: float64 (n, 2), map minus survey, east and north, metres.
+    names: of the points. error: float64 (n, 2), map minus survey, east and north, metres.
     """
     if len(names) < 3:
         return []

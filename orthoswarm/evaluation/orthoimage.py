@@ -3,7 +3,6 @@
 import dataclasses
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -51,18 +50,15 @@ def evaluate_ortho(
     """Measure an orthoimage file against a reference file; memory stays small whatever their size.
 
     Args:
-        ortho: RGB(A) or grey GeoTIFF.
-        reference: the same, any CRS.
-        mask: raster that is not 0 where blocks may be compared.
-        settings: how to measure; its gsd_m is replaced.
+        ortho: RGB(A) or grey GeoTIFF. reference: the same, any CRS.
+        mask: raster that is not 0 where blocks may be compared. settings: how to measure; its gsd_m is replaced.
         gsd_m: pixel of the comparison, None for 0.3 m or the coarser of both if that is more.
 
     Raises:
         InputError: if a file cannot be read or the two do not overlap.
     """
     field, covered, ground, s = _field(ortho, reference, mask, settings, gsd_m)
-    step, thin = max(1, round(s.step_m / s.gsd_m)), max(1, round(1.2 / s.gsd_m))
-    return accuracy(field, completeness(covered, ground, s.gsd_m * thin), float(step))
+    return accuracy(field, completeness(covered, ground), float(max(1, round(s.step_m / s.gsd_m))))
 
 
 def displacements(ortho: Path, reference: Path, mask: Path | None, settings: FieldSettings) -> Displacements:
@@ -78,46 +74,23 @@ def _field(
     with _Pair(ortho, reference, mask, gsd_m) as pair:
         s = dataclasses.replace(settings or FieldSettings(), gsd_m=pair.gsd_m)
         thin = max(1, round(1.2 / s.gsd_m))
-        for strip in _readable(pair.strips(s), f"{ortho} or {reference}"):
-            args = (strip.ortho, strip.ortho_valid, strip.reference, strip.comparable)
-            parts.append(displacement_field(*args, settings=s, offset=(strip.first_row, 0)))
-            own_ortho.append(strip.own_ortho[::thin, ::thin])
-            own_ground.append(strip.own_ground[::thin, ::thin])
+        try:
+            for first_row, compared, strip_ortho, strip_ground in pair.strips(s):
+                parts.append(displacement_field(*compared, settings=s, offset=(first_row, 0)))
+                own_ortho.append(strip_ortho[::thin, ::thin])
+                own_ground.append(strip_ground[::thin, ::thin])
+        except RasterioIOError:
+            raise InputError(f"{ortho} or {reference} is damaged or cut short; copy or make it again") from None
     covered, ground = np.concatenate(own_ortho), np.concatenate(own_ground)
     if not (covered & ground).any():
         raise InputError(f"{ortho.name} and {reference.name} do not overlap; check that both show the same place")
     return Displacements.joined(parts), covered, ground, s
 
 
-def _readable(strips: "Iterator[_Strip]", names: str) -> "Iterator[_Strip]":
-    """Strips, and one sentence where a file is damaged."""
-    try:
-        yield from strips
-    except RasterioIOError:
-        raise InputError(f"{names} is damaged or cut short; copy or make it again") from None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Strip:
-    """Some rows of blocks: pictures with validity, and the validity of the rows that belong to this strip alone.
-
-    The orthoimage is larger than the reference by the search radius on every side.
-    """
-
-    first_row: int
-    ortho: Floats
-    ortho_valid: Mask
-    reference: Floats
-    comparable: Mask
-    own_ortho: Mask
-    own_ground: Mask
-
-
 class _Pair:
     """Orthoimage, reference and mask on one grid, read in strips of blocks."""
 
     def __init__(self, ortho: Path, reference: Path, mask: Path | None, gsd_m: float | None) -> None:
-
         files = []
         for path in (ortho, reference, mask):
             if path is None:
@@ -166,8 +139,12 @@ class _Pair:
         for file in [*self._views, *self._files]:
             file.close()
 
-    def strips(self, s: FieldSettings) -> Iterator[_Strip]:
-        """Strips of eight rows of blocks, from north to south."""
+    def strips(self, s: FieldSettings) -> Iterator[tuple[int, tuple[Floats, Mask, Floats, Mask], Mask, Mask]]:
+        """Strips of eight rows of blocks, from north to south: first row, what is compared, and validity.
+
+        Compared are orthoimage and reference, each with its validity; the orthoimage is larger by the search radius on
+        every side. The last two are the validity of both in the rows that belong to this strip alone.
+        """
         reach = max(1, round(s.search_m / s.gsd_m))
         side, step = round(s.block_m / s.gsd_m), max(1, round(s.step_m / s.gsd_m))
         rows = 8 * step
@@ -175,18 +152,12 @@ class _Pair:
             stop = min(self.shape[0], start + rows - step + side)
             ortho, ortho_valid = self._read(0, start, stop, reach)
             reference, ground = self._read(1, start, stop)
-            comparable = ground & self._mask(start, stop) if self._masked else ground
+            comparable = ground
+            if self._masked:
+                comparable = ground & (self._views[2].read(1, window=Window(0, start, self.shape[1], stop - start)) > 0)
             own = min(rows, stop - start)
             inner = ortho_valid[reach : reach + own, reach : reach + self.shape[1]]
-            yield _Strip(
-                first_row=start,
-                ortho=ortho,
-                ortho_valid=ortho_valid,
-                reference=reference,
-                comparable=comparable,
-                own_ortho=inner,
-                own_ground=ground[:own],
-            )
+            yield start, (ortho, ortho_valid, reference, comparable), inner, ground[:own]
 
     def _read(self, which: int, start: int, stop: int, spare: int = 0) -> tuple[Floats, Mask]:
         """Grey values and validity of some rows, with `spare` more pixels on every side, invalid beyond the grid."""
@@ -198,11 +169,6 @@ class _Pair:
         data = view.read(bands, window=window).astype(np.float32)
         gray = data[0] if len(bands) == 1 else 0.299 * data[0] + 0.587 * data[1] + 0.114 * data[2]
         return np.pad(gray, pad), np.pad(view.dataset_mask(window=window) > 0, pad)
-
-    def _mask(self, start: int, stop: int) -> Mask:
-
-        mask: Mask = self._views[2].read(1, window=Window(0, start, self.shape[1], stop - start)) > 0
-        return mask
 
 
 def _floor(value: float, step: float) -> float:

@@ -28,8 +28,7 @@ def photos_named(known: Collection[str], image: str) -> list[str]:
 def photo_named(known: Collection[str], image: str) -> str | None:
     """The photo of a name (see `photos_named`), None if there is none.
 
-    Raises:
-        InputError: several photos have that name.
+    Raises InputError: several photos have that name.
     """
     found = photos_named(known, image)
     if len(found) > 1:

@@ -15,18 +15,13 @@ _RELIEF_SIGMA_M: Final = 10.0  # ground off the area's level where rays do not t
 
 @dataclass(frozen=True, slots=True)
 class Ray:
-    """A mark as a ray from the camera.
+    """A mark as a ray from the camera."""
 
-    Attributes:
-        image: the photo. position: float64 (3,), the camera's, metres. direction: float64 (3,), unit vector.
-        pixel_rad: sigma of the mark, radians. camera_sigma_m: how far the camera may be off others, an axis, metres.
-    """
-
-    image: str
-    position: Array
-    direction: Array
-    pixel_rad: float
-    camera_sigma_m: float
+    image: str  # the photo
+    position: Array  # float64 (3,), the camera's, metres
+    direction: Array  # float64 (3,), unit vector
+    pixel_rad: float  # sigma of the mark, radians
+    camera_sigma_m: float  # how far the camera may be off others, an axis, metres
 
     def sigma_m(self, ground_z_m: float) -> float:
         """Sigma across the ray where it meets the ground, metres."""
@@ -35,18 +30,13 @@ class Ray:
 
 @dataclass(frozen=True, slots=True)
 class RayPoint:
-    """Where rays meet.
+    """Where rays meet."""
 
-    Attributes:
-        place: float64 (2,), east and north. miss_m: root mean square of the rays' distances from it, metres.
-        left_out: photos of marks that all others contradict, and by how many metres.
-        contradiction: the largest distance of a ray where rays miss each other by more than their sigmas allow and none
-            can be called the wrong one, metres; 0 where they meet.
-    """
-
-    place: Array
-    miss_m: float
-    left_out: tuple[tuple[str, float], ...] = ()
+    place: Array  # float64 (2,), east and north
+    miss_m: float  # root mean square of the rays' distances from it, metres
+    left_out: tuple[tuple[str, float], ...] = ()  # photos of marks that all others contradict, and by how many metres
+    # the largest distance of a ray where rays miss each other by more than their sigmas allow and none can be called
+    # the wrong one, metres; 0 where they meet
     contradiction: float = 0.0
 
     def findings(self, name: str) -> list[str]:

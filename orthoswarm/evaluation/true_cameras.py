@@ -3,7 +3,7 @@
 import csv
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +22,7 @@ from orthoswarm.model.geo import LocalGrid
 def read_truth(path: Path) -> dict[str, tuple[str, int, Camera]]:
     """True cameras of a twin's frames.csv: image -> (vehicle, EPSG, camera).
 
-    Raises:
-        InputError: if the file is not such a table.
+    Raises InputError: if the file is not such a table.
     """
     try:
         with path.open(newline="") as file:
@@ -57,26 +56,16 @@ def _size(row: dict[str, str], truth: Path) -> tuple[int, int]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoseErrors:
-    """Errors of placed frames, arrays over the compared frames (NaN where not stated).
+    """Errors of placed frames, arrays over the compared frames (NaN where not stated)."""
 
-    Attributes:
-        image: names. vehicle: ids.
-        position_m: float64 (N, 3), camera's east, north, up minus truth.
-        angle_deg: float64 (N, 3), grid yaw, pitch, roll minus truth.
-        fov_deg: float64 (N,), minus truth.
-        center_m: float64 (N, 2), ground point of the picture's centre minus truth, on the mean ground level.
-        nadir_m: float64 (N, 2), the same at the pixel that truly looks straight down (no height plays a part).
-        sigma_m: float64 (N,), stated.
-    """
-
-    image: list[str]
-    vehicle: list[str]
-    position_m: Array
-    angle_deg: Array
-    fov_deg: Array
-    center_m: Array
-    nadir_m: Array
-    sigma_m: Array
+    image: list[str]  # names
+    vehicle: list[str]  # ids
+    position_m: Array  # float64 (N, 3), camera's east, north, up minus truth
+    angle_deg: Array  # float64 (N, 3), grid yaw, pitch, roll minus truth
+    fov_deg: Array  # float64 (N,), minus truth
+    center_m: Array  # float64 (N, 2), ground point of the picture's centre minus truth, on the mean ground level
+    nadir_m: Array  # float64 (N, 2), the same at the pixel that truly looks straight down (no height plays a part)
+    sigma_m: Array  # float64 (N,), stated
 
     def figures(self) -> dict[str, Any]:
         """Numbers for a report: medians, 95 % values, FoV per vehicle, honesty of the stated sigma.
@@ -111,8 +100,7 @@ def evaluate_poses(poses: Path, truth: Path) -> PoseErrors:
     The plane of the homographies is `ground_z_m` of report.json in the folder of frames.jsonl (0 without one); the true
     ground level is the median of dtm.tif in the folder of the truth, at the cameras' nadirs (0 without one).
 
-    Raises:
-        InputError: if nothing in common can be read.
+    Raises InputError: if nothing in common can be read.
     """
     true = read_truth(truth)
     placed, cameras = [], []
@@ -159,8 +147,7 @@ def camera_from_homography(homography: Array, lens: Lens, ground_z_m: float) -> 
 
     Args:
         homography: 3x3, pixel (column, row, 1) to (east, north).
-        lens: its focal length and principal point (distortion plays no part).
-        ground_z_m: height of the plane.
+        lens: its focal length and principal point (distortion plays no part). ground_z_m: height of the plane.
     """
     u, v = lens.principal_point
     center = homography @ np.array([u, v, 1.0])
@@ -179,18 +166,13 @@ def camera_from_homography(homography: Array, lens: Lens, ground_z_m: float) -> 
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """A frame as a product places it.
+    """A frame as a product places it."""
 
-    Attributes:
-        image: name. vehicle: id. homography: 3x3, undistorted pixel to (east, north) on a plane.
-        fov_deg: its field of view, None if not stated. sigma_m: its own estimate of the ground error, None if none.
-    """
-
-    image: str
+    image: str  # name
     vehicle: str
-    homography: Array
-    fov_deg: float | None
-    sigma_m: float | None
+    homography: Array  # 3x3, undistorted pixel to (east, north) on a plane
+    fov_deg: float | None  # its field of view, None if not stated
+    sigma_m: float | None  # its own estimate of the ground error, None if none
 
 
 def _median_p95(values: Array) -> tuple[float | None, float | None]:
@@ -214,8 +196,7 @@ def pose_errors(
     """Compare placed frames with their true cameras, in the same grid and order.
 
     Args:
-        placed: frames as placed.
-        truth: the true camera of each.
+        placed: frames as placed. truth: the true camera of each.
         ground_z_m: height of the plane of the homographies, in the product's heights.
         true_ground_z_m: the mean ground level in the truth's heights.
     """
@@ -226,7 +207,8 @@ def pose_errors(
         middle = np.array(true.lens.principal_point)
         center[i] = _apply(frame.homography, middle) - true.to_ground(middle, true_ground_z_m)
         down = true.position - np.array([0, 0, 1.0])
-        pinhole = Camera(true.position, true.rotation, _without_distortion(true.lens))
+        undistorted = replace(true.lens, k1=0.0, k2=0.0, k3=0.0)
+        pinhole = Camera(true.position, true.rotation, undistorted)
         nadir[i] = _apply(frame.homography, pinhole.project(down)) - true.position[:2]
         sigma[i] = np.nan if frame.sigma_m is None else frame.sigma_m
         if frame.fov_deg is None:
@@ -239,21 +221,11 @@ def pose_errors(
         turn = np.array(angles_from_rotation(camera.rotation)) - np.array(angles_from_rotation(true.rotation))
         angle[i] = wrap_deg(np.degrees(turn))
     return PoseErrors(
-        image=[p.image for p in placed],
-        vehicle=[p.vehicle for p in placed],
-        position_m=position,
-        angle_deg=angle,
-        fov_deg=fov,
-        center_m=center,
-        nadir_m=nadir,
-        sigma_m=sigma,
-    )
+        image=[p.image for p in placed], vehicle=[p.vehicle for p in placed], position_m=position, angle_deg=angle,
+        fov_deg=fov, center_m=center, nadir_m=nadir, sigma_m=sigma,
+    )  # fmt: skip
 
 
 def _apply(homography: Array, pixel: Array) -> Array:
     p = homography @ np.array([pixel[0], pixel[1], 1.0])
     return np.asarray(p[:2] / p[2])
-
-
-def _without_distortion(lens: Lens) -> Lens:
-    return Lens(lens.width, lens.height, lens.focal_px, cx=lens.cx, cy=lens.cy)

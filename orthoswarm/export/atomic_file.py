@@ -10,16 +10,14 @@ from typing import Final
 
 from orthoswarm.model.errors import DiskFullError, StorageError
 
-FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
-"""What the system says of a full disk, or of a used quota."""
+FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})  # what the system says of a full disk, or of a used quota
 
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
     """Yield a temporary path to write to; on success it replaces `path`, on failure it is removed.
 
-    Raises:
-        StorageError: if the disk is full or the folder cannot be written.
+    Raises StorageError: if the disk is full or the folder cannot be written.
     """
     part = path.with_name(f".{path.stem}.part{os.getpid()}{path.suffix}")
     try:
@@ -40,8 +38,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
 def write_file(path: Path, content: str | bytes | Iterable[str]) -> None:
     """Write a file, texts in UTF-8, that appears when it is complete.
 
-    Raises:
-        StorageError: if the disk is full or the folder cannot be written.
+    Raises StorageError: if the disk is full or the folder cannot be written.
     """
     with atomic_write(path) as part:
         if isinstance(content, bytes):

@@ -20,8 +20,7 @@ from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
 
 Row = Mapping[str, Any]
-Find = Callable[[Row], Path | None]
-"""Returns the picture file of a row, None if it is missing."""
+Find = Callable[[Row], Path | None]  # returns the picture file of a row, None if it is missing
 Tell = Callable[[int, int], None]
 _UNKNOWN_SIGMA_M: Final = 10.0  # stated for a picture of which no error is known: a receiver's in a bad place
 _MOST_STEM: Final = 120  # characters; file systems take names of 255 bytes
@@ -29,16 +28,11 @@ _MOST_STEM: Final = 120  # characters; file systems take names of 255 bytes
 
 @dataclass(frozen=True, slots=True)
 class OrientedPicture:
-    """A placed picture of a map.
+    """A placed picture of a map."""
 
-    Attributes:
-        name: unique plain file name. row: its line in frames.jsonl.
-        camera: position in the map's grid (east, north, height), orientation and lens.
-    """
-
-    name: str
-    row: Row
-    camera: Camera
+    name: str  # unique plain file name
+    row: Row  # its line in frames.jsonl
+    camera: Camera  # position in the map's grid (east, north, height), orientation and lens
 
 
 def camera_of(row: Row) -> Camera:
@@ -61,11 +55,7 @@ def _grid(epsg: int) -> LocalGrid:
 
 
 def placed_rows(rows: Iterable[Row]) -> list[Row]:
-    """The lines of placed pictures.
-
-    Raises:
-        InputError: there is none.
-    """
+    """The lines of placed pictures. Raises InputError: there is none."""
     placed = [row for row in rows if row["stage"] != "rejected" and "camera" in row]
     if not placed:
         raise InputError("the map has no placed picture to export; make it again")
@@ -80,8 +70,7 @@ def stated_sigma_m(row: Row) -> float:
 def oriented_pictures(rows: Iterable[Row]) -> list[OrientedPicture]:
     """The placed pictures of a map.
 
-    Raises:
-        InputError: there is none, or the map was made before cameras held their lens.
+    Raises InputError: there is none, or the map was made before cameras held their lens.
     """
     placed = placed_rows(rows)
     if any("focal_px" not in row["camera"] for row in placed):
@@ -120,8 +109,7 @@ def link_pictures(
 ) -> list[bool]:
     """Link the pictures' files into a new folder under their names; returns for each whether it was there.
 
-    Raises:
-        OrthoSwarmError: if the disk is full.
+    Raises OrthoSwarmError: if the disk is full.
     """
     folder.mkdir(parents=True)
     there = []
@@ -144,8 +132,7 @@ def link_oriented(pictures: Sequence[OrientedPicture], find: Find, folder: Path,
 def _link(file: Path, target: Path) -> None:
     """Link a file under another name, or copy it if the file system has no links.
 
-    Raises:
-        FileExistsError: the name is taken. A copy there would be written into the file that it is linked to.
+    Raises FileExistsError: the name is taken. A copy there would be written into the file that it is linked to.
     """
     try:
         os.link(file, target)

@@ -48,8 +48,7 @@ class PixelSource(Protocol):
         """Colours uint8 (rows, columns, 4) of a window of the picture reduced by a power of two."""
 
 
-CLASSIC_BYTES = 2**32 - 2**20
-"""Size that a classic TIFF with its 32-bit offsets can have, with some room."""
+CLASSIC_BYTES = 2**32 - 2**20  # size that a classic TIFF with its 32-bit offsets can have, with some room
 
 
 def write_cog(
@@ -65,11 +64,9 @@ def write_cog(
     """Write a source as a COG: RGBA uint8, deflate, tiles of 512, overviews by powers of two.
 
     Args:
-        source: where the pixels come from.
-        path: the file; appears when it is complete.
+        source: where the pixels come from. path: the file; appears when it is complete.
         window: rows and columns (row0, row1, col0, col1) to write, the first ones multiples of TILE_PX; None for all.
-        progress: called with tiles written and tiles in all.
-        threads: how many tiles are compressed at once.
+        progress: called with tiles written and tiles in all. threads: how many tiles are compressed at once.
         classic_bytes: a file that may become larger is a BigTIFF.
         time_s: UTC epoch seconds for the tag DateTime, None to leave it out.
 
@@ -78,7 +75,9 @@ def write_cog(
     """
     row0, row1, col0, col1 = window or (0, source.grid.height, 0, source.grid.width)
     row1, col1 = max(row1, row0 + 1), max(col1, col0 + 1)
-    levels = _levels(row1 - row0, col1 - col0)
+    levels = [_Level(1, row1 - row0, col1 - col0)]
+    while max(levels[-1].rows, levels[-1].cols) > TILE_PX:
+        levels.append(_Level(2 * levels[-1].factor, row1 - row0, col1 - col0))
     with atomic_write(path) as part, part.open("w+b") as file:
         tables = _write_directories(
             file, source.grid, (row0, col0), levels=levels, form=_form_of(levels, classic_bytes), time_s=time_s
@@ -104,13 +103,6 @@ class _Level:
         self.rows, self.cols = -(-rows // factor), -(-cols // factor)
         self.tile_rows, self.tile_cols = -(-self.rows // TILE_PX), -(-self.cols // TILE_PX)
         self.tiles = self.tile_rows * self.tile_cols
-
-
-def _levels(rows: int, cols: int) -> list[_Level]:
-    levels = [_Level(1, rows, cols)]
-    while max(levels[-1].rows, levels[-1].cols) > TILE_PX:
-        levels.append(_Level(2 * levels[-1].factor, rows, cols))
-    return levels
 
 
 class _Table:
@@ -205,19 +197,13 @@ _WORST_TILE = _TILE_BYTES + _TILE_BYTES // 64 + 1024  # deflate stores what it c
 
 @dataclass(frozen=True, slots=True)
 class _Form:
-    """The two forms of a TIFF, which differ in the width of offsets and counts.
+    """The two forms of a TIFF, which differ in the width of offsets and counts."""
 
-    Attributes:
-        header: of the file, without the offset of its first directory.
-        word: bytes of an offset or of an entry's count. count: struct format of a directory's number of entries.
-        place: struct format of an offset. place_kind: TIFF type of an offset.
-    """
-
-    header: bytes
-    word: int
-    count: str
-    place: str
-    place_kind: int
+    header: bytes  # of the file, without the offset of its first directory
+    word: int  # bytes of an offset or of an entry's count
+    count: str  # struct format of a directory's number of entries
+    place: str  # struct format of an offset
+    place_kind: int  # TIFF type of an offset
 
     @property
     def entry(self) -> int:
@@ -343,8 +329,7 @@ def convert_cog(source: Path, path: Path, *, epsg: int | None = None, jpeg_quali
     """Write a raster as a COG.
 
     Args:
-        source: a georeferenced RGBA raster.
-        path: the file; appears when it is complete.
+        source: a georeferenced RGBA raster. path: the file; appears when it is complete.
         epsg: its coordinate system; None keeps the source's.
         jpeg_quality: 1 to 100 for JPEG with a mask instead of the alpha band; None is lossless.
 
@@ -370,7 +355,15 @@ def convert_cog(source: Path, path: Path, *, epsg: int | None = None, jpeg_quali
                 copy_dataset(raster, part, **settings)
                 return
             with WarpedVRT(raster, crs=crs, resampling=rasterio.enums.Resampling.cubic, warp_mem_limit=64) as vrt:
-                _copy_warped(vrt, part, settings, raster.tags().get(_DATE))
+                # A warped raster has none of its source's tags: it is copied by way of a description that has.
+                date = raster.tags().get(_DATE)
+                with tempfile.TemporaryDirectory(dir=part.parent, prefix=".warped") as folder:
+                    described = Path(folder) / "warped.vrt"
+                    copy_dataset(vrt, described, driver="VRT")
+                    with rasterio.open(described, "r+") as file:
+                        file.update_tags(TIFFTAG_SOFTWARE=software(), **({_DATE: date} if date else {}))
+                    with rasterio.open(described) as file:
+                        copy_dataset(file, part, **settings)
     except (CRSError, RasterioError) as error:
         raise InputError(f"{source.name} cannot be written as asked ({_first_line(error)}); check --epsg") from None
 
@@ -414,16 +407,3 @@ def _is_whole(dataset: Any) -> bool:
     except RasterioError:
         return False
     return True
-
-
-def _copy_warped(vrt: Any, part: Path, settings: dict[str, Any], date: str | None) -> None:
-    """Copy a warped raster, which has none of its source's tags, by way of a description that has."""
-    import rasterio
-
-    with tempfile.TemporaryDirectory(dir=part.parent, prefix=".warped") as folder:
-        described = Path(folder) / "warped.vrt"
-        copy_dataset(vrt, described, driver="VRT")
-        with rasterio.open(described, "r+") as file:
-            file.update_tags(TIFFTAG_SOFTWARE=software(), **({_DATE: date} if date else {}))
-        with rasterio.open(described) as file:
-            copy_dataset(file, part, **settings)

@@ -17,8 +17,7 @@ from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.model.arrays import Array, Ints
 from orthoswarm.model.task_runner import Run, serial
 
-Feature = tuple[Mapping[str, Any], Array]
-"""What is known about a frame, and its outline."""
+Feature = tuple[Mapping[str, Any], Array]  # what is known about a frame, and its outline
 
 Column = type[np.generic]
 """np.object_ for text, np.float64 for numbers, np.datetime64 for times (ISO 8601, UTC; kept to a millisecond)."""
@@ -28,8 +27,7 @@ _FRAME: dict[str, Column] = {
 _FOOTPRINT = {**_FRAME, "fov_deg": np.float64, "sigma_m": np.float64}
 _SEAMLINE = {**_FRAME, "sigma_m": np.float64, "area_m2": np.float64}
 _AT_ONCE = 4096
-_UTC = 100
-"""GDAL's number of the time zone."""
+_UTC = 100  # GDAL's number of the time zone
 
 
 def write_footprints(path: Path, features: Iterable[Feature], epsg: int) -> None:
@@ -38,8 +36,7 @@ def write_footprints(path: Path, features: Iterable[Feature], epsg: int) -> None
     Args:
         path: the GeoPackage; appears when it is complete.
         features: values by the names of columns (those of frames.jsonl), and float64 (K, 2) rings on the ground, not
-            closed; an empty ring gives no feature.
-        epsg: their grid.
+            closed; an empty ring gives no feature. epsg: their grid.
 
     Raises:
         OrthoSwarmError: if the disk is full or the folder cannot be written.
@@ -57,8 +54,7 @@ def write_footprints(path: Path, features: Iterable[Feature], epsg: int) -> None
 def gpkg_file(path: Path) -> Iterator[Path]:
     """A path to write a GeoPackage to, which appears under its name when it is complete.
 
-    Raises:
-        OrthoSwarmError: if the disk is full or the folder cannot be written.
+    Raises OrthoSwarmError: if the disk is full or the folder cannot be written.
     """
     import pyogrio
 
@@ -99,17 +95,11 @@ def append_polygons(
     times = [name for name, kind in columns.items() if kind is np.datetime64]
     multi = len(shapes) > 0 and shapely.get_type_id(shapes[0]) == 6
     pyogrio.raw.write(
-        str(part),
-        shapely.to_wkb(shapes),
-        [_column([row.get(name) for row in rows], kind) for name, kind in columns.items()],
-        list(columns),
-        layer=layer,
-        driver="GPKG",
-        geometry_type="MultiPolygon" if multi else "Polygon",
-        crs=f"EPSG:{epsg}",
-        append=part.exists(),
+        str(part), shapely.to_wkb(shapes),
+        [_column([row.get(name) for row in rows], kind) for name, kind in columns.items()], list(columns), layer=layer,
+        driver="GPKG", geometry_type="MultiPolygon" if multi else "Polygon", crs=f"EPSG:{epsg}", append=part.exists(),
         gdal_tz_offsets={name: np.full(len(rows), _UTC) for name in times},
-    )
+    )  # fmt: skip
 
 
 def _column(values: list[Any], kind: type[np.generic]) -> NDArray[Any]:
@@ -122,10 +112,8 @@ def _column(values: list[Any], kind: type[np.generic]) -> NDArray[Any]:
     return column
 
 
-_OUTLINE_PX = 4
-"""Pixels of the map to a step of an outline: what is smaller belongs to its neighbour. It takes a tenth as long."""
-_JOINED_AT_ONCE = 64
-"""Frames that one task joins; it changes the speed, not the result."""
+_OUTLINE_PX = 4  # pixels of the map to a step of an outline: what is smaller is its neighbour's; ten times as fast
+_JOINED_AT_ONCE = 64  # frames that one task joins; it changes the speed, not the result
 
 
 def write_seamlines(
@@ -134,8 +122,7 @@ def write_seamlines(
     """Write a multipolygon for each picture that the orthoimage shows, drawn along every `_OUTLINE_PX`th pixel.
 
     Args:
-        path: the GeoPackage; appears when it is complete.
-        canvas: rendered, with plane "frame".
+        path: the GeoPackage; appears when it is complete. canvas: rendered, with plane "frame".
         describe: for each frame of the rendering what is known about it, by the columns `image`, `vehicle`, `time`,
             `stage` and `sigma_m`; called for frames that are shown.
         run: where tiles are outlined; other processes need the canvas's folder under the same path.

@@ -20,39 +20,26 @@ _NO_PLACES: Final = "there are no finds and no vehicles; `orthoswarm serve` keep
 
 @dataclass(frozen=True, kw_only=True)
 class MapExport:
-    """A map, and how it is to be exported.
+    """A map, and how it is to be exported."""
 
-    Attributes:
-        folder: of the map, as `orthoswarm mosaic` and the daemon write it. dest: folder for the files; a STAC item goes
-            beside the orthoimage.
-        layer: "orthoimage", "coarse" or "realtime"; empty for the last that is there.
-        places: finds and vehicles; None for those that the folder keeps.
-        find: returns the picture file of a line of frames.jsonl, None if it is missing; without it pictures are looked
-            for in `images`, or where they were when the map was made.
-        tile_format, quality: of MBTiles, and of JPEG and WebP, 1 to 100. epsg, jpeg: of the COG.
-        tell: called with steps done and in all. notes: what the user should know is added here.
-    """
-
-    folder: Path
-    dest: Path
-    layer: str = ""
-    places: "Sequence[Place] | None" = None
+    folder: Path  # of the map, as `orthoswarm mosaic` and the daemon write it
+    dest: Path  # folder for the files; a STAC item goes beside the orthoimage
+    layer: str = ""  # "orthoimage", "coarse" or "realtime"; empty for the last that is there
+    places: "Sequence[Place] | None" = None  # finds and vehicles; None for those that the folder keeps
+    # returns the picture file of a line of frames.jsonl, None if it is missing; without it pictures are looked for in
+    # `images`, or where they were when the map was made
     find: Callable[[Mapping[str, Any]], Path | None] | None = None
     images: Path | None = None
-    tile_format: Literal["png", "webp", "jpg"] = "png"
-    quality: int = 85
-    epsg: int | None = None
-    jpeg: bool = False
-    tell: Callable[[int, int], None] = lambda done, of: None
-    notes: list[str] = field(default_factory=list)
+    tile_format: Literal["png", "webp", "jpg"] = "png"  # of MBTiles
+    quality: int = 85  # of JPEG and WebP, 1 to 100
+    epsg: int | None = None  # of the COG
+    jpeg: bool = False  # of the COG
+    tell: Callable[[int, int], None] = lambda done, of: None  # called with steps done and in all
+    notes: list[str] = field(default_factory=list)  # what the user should know is added here
 
     @cached_property
     def picture(self) -> Path:
-        """The raster to export.
-
-        Raises:
-            InputError: there is none.
-        """
+        """The raster to export. Raises InputError: there is none."""
         from orthoswarm.export.catalog.tiled_raster import product_file
 
         names = [self.layer] if self.layer else ["orthoimage", "coarse", "realtime"]
@@ -67,8 +54,7 @@ class MapExport:
     def all_places(self) -> "Sequence[Place]":
         """Finds and vehicles, and the largest changes that `orthoswarm change` has found.
 
-        Raises:
-            InputError: the folder's list was changed to something else.
+        Raises InputError: the folder's list was changed to something else.
         """
         from orthoswarm.export.tactical.places import changed_places, read_places
 
@@ -199,21 +185,15 @@ def _title(what: MapExport) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Form:
-    """A form of a finished map.
+    """A form of a finished map."""
 
-    Attributes:
-        use: what it is for, in the help of the command line.
-        write: writes it and returns the file or folder; raises InputError if the map cannot be read, OrthoSwarmError
-            if the disk is full.
-        daemon: whether the daemon writes it, too. report: whether it says what report.json says.
-        replaces: whether in a map's folder it would replace a file of the map.
-    """
-
-    use: str
+    use: str  # what it is for, in the help of the command line
+    # writes it and returns the file or folder; raises InputError if the map cannot be read, OrthoSwarmError if the disk
+    # is full
     write: Callable[[MapExport], Path]
-    daemon: bool = True
-    report: bool = True
-    replaces: bool = False
+    daemon: bool = True  # whether the daemon writes it, too
+    report: bool = True  # whether it says what report.json says
+    replaces: bool = False  # whether in a map's folder it would replace a file of the map
 
 
 FORMS: Final = {

@@ -108,8 +108,7 @@ def camera_matrix(camera: Camera, ground_z_m: float) -> Array:
 def simple_lens(lens: Lens) -> tuple[Lens, Array]:
     """A lens with only k1 and k2 about the picture's centre that approximates a full one.
 
-    Returns:
-        The lens (same focal length), and the 3x3 matrix from its normalised coordinates to those of the full one.
+    Returns the lens (same focal length), and the 3x3 matrix from its normalised coordinates to those of the full one.
     """
     if not (lens.cx or lens.cy or lens.k3):
         return lens, np.eye(3)
@@ -288,7 +287,6 @@ def image_root(frames: Sequence[Frame]) -> str | None:
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Write one JSON document that appears when it is complete.
 
-    Raises:
-        OrthoSwarmError: if the disk is full or the folder cannot be written.
+    Raises OrthoSwarmError: if the disk is full or the folder cannot be written.
     """
     write_file(path, json_text(document, 1) + "\n")

@@ -6,8 +6,8 @@ larger window of the map around its expected position (the prior window). Learne
 """
 
 from orthoswarm.matchers.matcher import MapMatcher, Matches, PictureMatcher
+from orthoswarm.matchers.patch_registration import second_opinion
 from orthoswarm.matchers.registry import available, map_matcher, picture_matcher
-from orthoswarm.matchers.second_opinion import second_opinion
 
 __all__ = [
     "MapMatcher",

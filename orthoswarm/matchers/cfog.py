@@ -52,18 +52,11 @@ def features(gray: Floats, valid: Mask) -> Floats:
     return np.asarray(channels, np.float32)
 
 
-@dataclass(frozen=True, slots=True)
-class Peak:
-    """Peak of a correlation: shift (column, row) from the middle, its value, second highest peak / peak."""
+def correlate(tile: Floats, window: Floats) -> tuple[float, float, float, float]:
+    """Best position of a tile of features (D, h, w) in a window (D, h + 2 n, w + 2 n), by normalised correlation.
 
-    column: float
-    row: float
-    peak: float
-    ratio: float
-
-
-def correlate(tile: Floats, window: Floats) -> Peak:
-    """Best position of a tile of features (D, h, w) in a window (D, h + 2 n, w + 2 n), by normalised correlation."""
+    Returns its shift from the middle, column and row; the correlation there; and the second highest peak's share of it.
+    """
     from scipy import fft
 
     rows, cols = window.shape[1] - tile.shape[1] + 1, window.shape[2] - tile.shape[2] + 1
@@ -82,10 +75,10 @@ def correlate(tile: Floats, window: Floats) -> Peak:
     rest[max(0, r - apart) : r + apart + 1, max(0, c - apart) : c + apart + 1] = -1.0
     ratio = float(rest.max()) / max(peak, 1e-9)
     if not (0 < r < rows - 1 and 0 < c < cols - 1):
-        return Peak(c - (cols - 1) / 2, r - (rows - 1) / 2, peak, 1.0)
+        return c - (cols - 1) / 2, r - (rows - 1) / 2, peak, 1.0
     dc = vertex(float(score[r, c - 1]), peak, float(score[r, c + 1]))
     dr = vertex(float(score[r - 1, c]), peak, float(score[r + 1, c]))
-    return Peak(c + dc - (cols - 1) / 2, r + dr - (rows - 1) / 2, peak, ratio)
+    return c + dc - (cols - 1) / 2, r + dr - (rows - 1) / 2, peak, ratio
 
 
 def match_tiles(
@@ -94,12 +87,9 @@ def match_tiles(
     """Match tiles of a patch's features near where they are expected in a window's features.
 
     Args:
-        patch: (D, h, w) features.
-        window: (D, H, W) features.
-        valid: bool (h, w) of the patch.
+        patch: (D, h, w) features. window: (D, H, W) features. valid: bool (h, w) of the patch.
         predict: float64 (N, 2), expected column and row in the window of each tile's centre.
-        centres: int64 (N, 2), column and row of the tiles' centres.
-        search: reach about the expectation, pixels.
+        centres: int64 (N, 2), column and row of the tiles' centres. search: reach about the expectation, pixels.
 
     Returns:
         One match for each tile with a clear peak; the score is the peak.
@@ -117,11 +107,11 @@ def match_tiles(
         area = window[:, r0 : r0 + size, c0 : c0 + size]
         if area.shape[1:] != (size, size) or not area.any():
             continue
-        found = correlate(patch[(slice(None), *cut)], area)
-        if found.peak >= _CFOG_LEAST_PEAK and found.ratio <= _CFOG_MOST_RATIO:
+        column, row, peak, ratio = correlate(patch[(slice(None), *cut)], area)
+        if peak >= _CFOG_LEAST_PEAK and ratio <= _CFOG_MOST_RATIO:
             a.append((c, r))
-            b.append((wc + found.column, wr + found.row))
-            score.append(found.peak)
+            b.append((wc + column, wr + row))
+            score.append(peak)
     if not a:
         return Matches.none()
     return Matches(np.array(a, float), np.array(b, float), np.array(score))
@@ -158,15 +148,11 @@ class Cfog:
         inner = (slice(odd, odd + 2 * window_size[1]), slice(odd, odd + 2 * window_size[0]))
         coarse = cv2.resize(window[inner], window_size, interpolation=cv2.INTER_AREA)
         coarse_known = cv2.resize(known[inner].astype(np.uint8), window_size, interpolation=cv2.INTER_NEAREST) > 0
-        common = correlate(features(small, small_valid), features(coarse, coarse_known))
-        shift = np.array([reach + 2 * common.column, reach + 2 * common.row])
+        column, row, *_ = correlate(features(small, small_valid), features(coarse, coarse_known))
+        shift = np.array([reach + 2 * column, reach + 2 * row])
         centres = tile_centres(valid)
         wanted = centres + shift
         return match_tiles(
-            features(patch, valid),
-            features(window, known),
-            valid,
-            predict=wanted,
-            centres=centres,
+            features(patch, valid), features(window, known), valid, predict=wanted, centres=centres,
             search=_CFOG_SEARCH_PX,
-        )
+        )  # fmt: skip

@@ -36,11 +36,7 @@ class XFeatWindow:
 
     @classmethod
     def make(cls, device: str) -> "XFeatWindow":
-        """A matcher whose weights are known to be there.
-
-        Raises:
-            UnavailableError: if they are not.
-        """
+        """A matcher whose weights are known to be there. Raises UnavailableError: if they are not."""
         weight_files.require("xfeat")
         return cls(device)
 

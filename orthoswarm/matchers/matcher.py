@@ -14,16 +14,11 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Matches:
-    """Pairs of points that show the same ground.
+    """Pairs of points that show the same ground."""
 
-    Attributes:
-        a: float64 (N, 2), column and row in the first picture, pixel centres at integers; b: in the second.
-        score: float64 (N,), confidence 0 to 1; comparable only within one matcher.
-    """
-
-    a: Array
-    b: Array
-    score: Array
+    a: Array  # float64 (N, 2), column and row in the first picture, pixel centres at integers
+    b: Array  # in the second
+    score: Array  # float64 (N,), confidence 0 to 1; comparable only within one matcher
 
     def __len__(self) -> int:
         return len(self.a)
@@ -52,11 +47,9 @@ class MapMatcher(Protocol):
         """Matches from the patch (a) to the window (b).
 
         Args:
-            patch: float32 (h, w), grey 0 to 255.
-            valid: bool (h, w), where the patch has ground.
+            patch: float32 (h, w), grey 0 to 255. valid: bool (h, w), where the patch has ground.
             window: float32 (h + 2 reach, w + 2 reach), the map; the prior puts patch pixel (c, r) at window pixel
-                (c + reach, r + reach).
-            known: bool, the same shape, where the map has ground.
+                (c + reach, r + reach). known: bool, the same shape, where the map has ground.
             reach: the largest shift from the prior that is looked for, pixels.
         """
 

@@ -8,15 +8,13 @@ from orthoswarm.model.errors import InputError
 if TYPE_CHECKING:
     import torch
 
-DEVICES = ("auto", "cpu", "cuda")
-"""What may be asked for."""
+DEVICES = ("auto", "cpu", "cuda")  # what may be asked for
 
 
 def network_device(wanted: str = "auto") -> "torch.device":
     """The device asked for, with "auto" CUDA where torch sees a card, else the CPU.
 
-    Raises:
-        UnavailableError: CUDA was asked for and torch sees no card, or there is no device of that name.
+    Raises UnavailableError: CUDA was asked for and torch sees no card, or there is no device of that name.
     """
     import torch
 
@@ -33,8 +31,7 @@ def network_device(wanted: str = "auto") -> "torch.device":
 def require_device(wanted: str) -> None:
     """Refuse a device that was asked for and is not there, before a run begins; "auto" and "cpu" cost no import.
 
-    Raises:
-        InputError: what `network_device` says.
+    Raises InputError: what `network_device` says.
     """
     if wanted in ("auto", "cpu"):
         return

@@ -6,12 +6,15 @@ result with a share of a half or more was wrong.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
 
 from orthoswarm.matchers import cfog
 from orthoswarm.matchers.matcher import Array, Floats, MapMatcher, Mask, Matches
+from orthoswarm.matchers.registry import map_matcher
+from orthoswarm.model.errors import InputError
 
 _AGREEMENT_PX: Final = 3.0  # a tile agrees with a homography within this distance, pixels of the patch
 _COARSE_AGREEMENT_PX: Final = 6.0  # the same for the first homography, from the matcher's own matches
@@ -25,23 +28,19 @@ _PLAUSIBLE_REACH: Final = 1.5  # largest shift of a corner, search radii ...
 _PLAUSIBLE_SIDE_SHARE: Final = 0.05  # ... plus this share of the patch's longer side
 _SHIFT_WIDTH_PX: Final = 8.0  # matches share a common shift within this distance
 _SHIFT_SHARE: Final = 0.1  # least share of matches with the common shift
+LEAST_TILES: Final = 12  # least number of tiles that agree
+TRUSTED_SHARE: Final = 0.35  # least share of tiles that agree. By chance a tile agrees in one of twelve cases
 
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """Registration of a patch in a window of the map.
+    """Registration of a patch in a window of the map."""
 
-    Attributes:
-        homography: float64 (3, 3), patch pixel to window pixel, last element 1.
-        matches: tiles that agree. share: of all tiles with ground on both sides, those that agree.
-        rms_px: root mean square of their residuals per axis. tiles: how many tiles were tried.
-    """
-
-    homography: Array
-    matches: Matches
-    share: float
-    rms_px: float
-    tiles: int
+    homography: Array  # float64 (3, 3), patch pixel to window pixel, last element 1
+    matches: Matches  # tiles that agree
+    share: float  # of all tiles with ground on both sides, those that agree
+    rms_px: float  # root mean square of their residuals per axis
+    tiles: int  # how many tiles were tried
 
 
 Keep = Callable[[Matches, Array], Mask]
@@ -60,8 +59,7 @@ def register(
 ) -> Registration | None:
     """Find a patch in a window of the map (see MapMatcher for the frames).
 
-    Returns:
-        None where no homography is found; else the result, whose `share` may still be too low to trust it.
+    Returns None where no homography is found; else the result, whose `share` may still be too low to trust it.
     """
     first = matcher.match(patch, valid, window, known, reach)
     fit = magsac(first, _COARSE_AGREEMENT_PX)
@@ -155,3 +153,45 @@ def known_below(known: Mask, points: Array) -> Mask:
     out = np.zeros(len(points), bool)
     out[inside] = known[r[inside], c[inside]]
     return out
+
+
+def second_opinion(
+    patch: Floats,
+    valid: Mask,
+    window: Floats,
+    *,
+    known: Mask,
+    reach: int,
+    matcher: MapMatcher | None = None,
+    device: str = "auto",
+) -> tuple[float, float] | None:
+    """Position of a rectified strip of pictures on the map by learned matching.
+
+    Args:
+        patch: float32 (h, w), grey values of the strip. valid: bool (h, w), where it has ground.
+        window: float32 (h + 2 reach, w + 2 reach), the map at the same pixel size.
+        known: bool, where the map has ground.
+        reach: largest shift from the prior, pixels; the networks work best at 0.3 to 1 m per pixel.
+        matcher: None for the first available (CFOG without weights). device: where that runs, see `network_device`.
+
+    Returns:
+        Shift (column, row) of the strip's middle from the prior, pixels; None where too few tiles agree.
+    """
+    if matcher is None:
+        try:
+            matcher = _default(device)
+        except InputError:
+            return None
+    found = register(patch, valid, window, known=known, reach=reach, matcher=matcher)
+    if found is None or found.share < TRUSTED_SHARE or len(found.matches) < LEAST_TILES:
+        return None
+    middle = np.median(found.matches.a, axis=0)[None]
+    shift = (apply(found.homography, middle) - middle)[0] - reach
+    if np.abs(shift).max() > reach:
+        return None
+    return float(shift[0]), float(shift[1])
+
+
+@lru_cache(maxsize=1)
+def _default(device: str) -> MapMatcher:
+    return map_matcher(device=device)

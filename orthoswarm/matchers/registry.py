@@ -16,10 +16,8 @@ from orthoswarm.matchers.matcher import MapMatcher, PictureMatcher, UnavailableE
 from orthoswarm.model.errors import InputError
 
 GROUP = "orthoswarm.matchers"
-PICTURE_ORDER = ("xfeat", "sift")
-"""Default matcher of pictures: the first of these that is available."""
-MAP_ORDER = ("xfeat-window", "cfog")
-"""Default matcher of patches on the map: the first of these that is available."""
+PICTURE_ORDER = ("xfeat", "sift")  # default matcher of pictures: the first of these that is available
+MAP_ORDER = ("xfeat-window", "cfog")  # default matcher of patches on the map: the first of these that is available
 
 
 def _learned(kind: Any, device: str) -> PictureMatcher:
@@ -62,8 +60,7 @@ MAP: dict[str, Callable[[str], MapMatcher]] = {"xfeat-window": _window, "cfog": 
 def picture_matcher(name: str | None = None, device: str = "auto") -> PictureMatcher:
     """A matcher of pictures by name; without a name the first available of PICTURE_ORDER, on a `network_device`.
 
-    Raises:
-        InputError: if the name is unknown, or its weights or packages are missing.
+    Raises InputError: if the name is unknown, or its weights or packages are missing.
     """
     matcher: PictureMatcher = _get(name, PICTURE, PICTURE_ORDER, device)
     return matcher
@@ -72,8 +69,7 @@ def picture_matcher(name: str | None = None, device: str = "auto") -> PictureMat
 def map_matcher(name: str | None = None, device: str = "auto") -> MapMatcher:
     """A matcher of patches on the map by name; without a name the first available of MAP_ORDER, on a `network_device`.
 
-    Raises:
-        InputError: if the name is unknown, or its weights or packages are missing.
+    Raises InputError: if the name is unknown, or its weights or packages are missing.
     """
     matcher: MapMatcher = _get(name, MAP, MAP_ORDER, device)
     return matcher

@@ -25,8 +25,7 @@ _ROMA_CERTAINTY: Final = 0.3  # least certainty of a match
 def load(state: dict[str, Any], backbone: dict[str, Any], device: Any) -> Any:
     """The network from its own state and that of its DINOv2 backbone, on a torch device.
 
-    Raises:
-        UnavailableError: if the package is missing or the states do not fit it.
+    Raises UnavailableError: if the package is missing or the states do not fit it.
     """
     try:
         from romatch import roma_outdoor
@@ -65,22 +64,16 @@ def _network(device: Any) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Roma:
-    """Patch to map by RoMa: the patch against the window, matches beyond the reach dropped.
+    """Patch to map by RoMa: the patch against the window, matches beyond the reach dropped."""
 
-    Attributes:
-        network: something with `match(image, image)`, `sample(warp, certainty)` and `to_pixel_coordinates`.
-        device: where it runs, see `network_device`.
-    """
-
-    network: Any
-    device: str = "auto"
+    network: Any  # something with `match(image, image)`, `sample(warp, certainty)` and `to_pixel_coordinates`
+    device: str = "auto"  # where it runs, see `network_device`
 
     @classmethod
     def make(cls, device: str) -> "Roma":
         """A matcher with the weights of this machine.
 
-        Raises:
-            UnavailableError: if the package or the weights are missing.
+        Raises UnavailableError: if the package or the weights are missing.
         """
         return cls(_network(network_device(device)), device)
 

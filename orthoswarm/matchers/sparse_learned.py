@@ -27,8 +27,7 @@ _LEARNED_LEAST_KEYPOINTS: Final = 4  # pictures with fewer keypoints are not mat
 def read_state(name: str) -> dict[str, Any]:
     """The tensors of a weight file, read without executing code that the file may contain.
 
-    Raises:
-        UnavailableError: if the file is missing or damaged.
+    Raises UnavailableError: if the file is missing or damaged.
     """
     import torch
 
@@ -103,22 +102,14 @@ def padded_tensor(gray: Gray, stride: int, device: str, channels: int = 1) -> An
 
 @dataclass(frozen=True, slots=True)
 class Learned:
-    """Keypoints of one network, matched by LightGlue.
+    """Keypoints of one network, matched by LightGlue."""
 
-    Attributes:
-        kind: which network. device: where it runs, see `network_device`.
-    """
-
-    kind: Kind = "xfeat"
-    device: str = "auto"
+    kind: Kind = "xfeat"  # which network
+    device: str = "auto"  # where it runs, see `network_device`
 
     @classmethod
     def make(cls, kind: Kind, device: str) -> "Learned":
-        """A matcher whose weights are known to be there.
-
-        Raises:
-            UnavailableError: if they are not.
-        """
+        """A matcher whose weights are known to be there. Raises UnavailableError: if they are not."""
         weight_files.require(_EXTRACTOR[kind])
         weight_files.require(_MATCHER[kind])
         return cls(kind, device)

@@ -14,23 +14,16 @@ from orthoswarm.model.errors import InputError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WeightFile:
-    """A file of weights.
+    """A file of weights."""
 
-    Attributes:
-        name: its name in this program. file: its name on disk; also: other common names of the same file.
-        package: the distribution that contains it, None if no package does. folder: inside that package.
-        sha256: of the published file, None if any training is accepted.
-        used_by: matchers that need it. licence: of the weights.
-    """
-
-    name: str
-    file: str
-    also: tuple[str, ...]
-    package: str | None
-    folder: str
-    sha256: str | None
-    used_by: tuple[str, ...]
-    licence: str
+    name: str  # its name in this program
+    file: str  # its name on disk
+    also: tuple[str, ...]  # other common names of the same file
+    package: str | None  # the distribution that contains it, None if no package does
+    folder: str  # inside that package
+    sha256: str | None  # of the published file, None if any training is accepted
+    used_by: tuple[str, ...]  # matchers that need it
+    licence: str  # of the weights
 
 
 KNOWN = {
@@ -150,8 +143,7 @@ def find(name: str) -> Path | None:
 def require(name: str) -> Path:
     """Path of a weight file, by its name in this program.
 
-    Raises:
-        UnavailableError: if it is not on this machine; the message says where to get it.
+    Raises UnavailableError: if it is not on this machine; the message says where to get it.
     """
     path = find(name)
     if path is None:
@@ -184,8 +176,7 @@ def identify(path: Path) -> WeightFile | None:
 def import_weights(source: Path) -> list[tuple[WeightFile, Path]]:
     """Copy a weight file, or all known ones of a folder, to the user's own folder.
 
-    Raises:
-        InputError: if there is no known weight file, or one is damaged.
+    Raises InputError: if there is no known weight file, or one is damaged.
     """
     if not source.exists():
         raise InputError(f"{source} does not exist; give a file of weights or a folder with some")

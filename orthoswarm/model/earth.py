@@ -7,12 +7,10 @@ from numpy.typing import ArrayLike, NDArray
 
 MEAN_RADIUS_M = 6_371_008.8
 """Mean radius of the ellipsoid, (2 a + b) / 3 of GRS 80 (Moritz 2000, Journal of Geodesy 74)."""
-DEGREE_M = math.radians(MEAN_RADIUS_M)
-"""Length of a degree of a great circle, metres."""
+DEGREE_M = math.radians(MEAN_RADIUS_M)  # length of a degree of a great circle, metres
 EQUATOR_RADIUS_M = 6_378_137.0
 """Semi-major axis of WGS 84, metres; also the radius of the sphere of Web Mercator (EPSG 3857)."""
-WEB_MERCATOR_M = 2.0 * math.pi * EQUATOR_RADIUS_M
-"""Side of the square that holds the world in Web Mercator, metres."""
+WEB_MERCATOR_M = 2.0 * math.pi * EQUATOR_RADIUS_M  # side of the square that holds the world in Web Mercator, metres
 
 
 def distance_m(lat1_deg: float, lon1_deg: float, lat2_deg: float, lon2_deg: float) -> float:

@@ -49,13 +49,9 @@ def area_epsg(lat_deg: ArrayLike, lon_deg: ArrayLike) -> int:
 
 @dataclass(frozen=True)
 class LocalGrid:
-    """A UTM grid: turns latitude and longitude into grid metres and back.
+    """A UTM grid: turns latitude and longitude into grid metres and back."""
 
-    Attributes:
-        epsg: EPSG code of a projected CRS in metres, normally WGS 84 / UTM.
-    """
-
-    epsg: int
+    epsg: int  # EPSG code of a projected CRS in metres, normally WGS 84 / UTM
 
     @cached_property
     def _forward(self) -> Transformer:
@@ -87,23 +83,14 @@ class LocalGrid:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GroundGrid:
-    """The grid of a north-up raster: location, pixel size and extent.
+    """The grid of a north-up raster: location, pixel size and extent."""
 
-    Attributes:
-        epsg: CRS of the raster.
-        west: easting of the left edge (not of a pixel's centre), metres.
-        north: northing of the upper edge, metres.
-        gsd_m: side of a pixel, metres.
-        width: columns.
-        height: rows.
-    """
-
-    epsg: int
-    west: float
-    north: float
-    gsd_m: float
-    width: int
-    height: int
+    epsg: int  # CRS of the raster
+    west: float  # easting of the left edge (not of a pixel's centre), metres
+    north: float  # northing of the upper edge, metres
+    gsd_m: float  # side of a pixel, metres
+    width: int  # columns
+    height: int  # rows
 
     @classmethod
     def around(cls, epsg: int, bounds: BoundingBox, gsd_m: float) -> "GroundGrid":

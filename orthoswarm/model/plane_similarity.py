@@ -13,16 +13,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Similarity:
-    """A plane similarity and how well it is known.
+    """A plane similarity and how well it is known."""
 
-    Attributes:
-        middle: float64 (2,). values: float64 (4,), shift east and north in metres, turn (radians, counter-clockwise),
-            scale minus one. covariance: float64 (4, 4) of them.
-    """
-
-    middle: Array
-    values: Array
-    covariance: Array
+    middle: Array  # float64 (2,)
+    values: Array  # float64 (4,), shift east and north in metres, turn (radians, counter-clockwise), scale minus one
+    covariance: Array  # float64 (4, 4) of them
 
     @classmethod
     def between(

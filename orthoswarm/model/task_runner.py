@@ -5,8 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
 T = TypeVar("T")
-Progress = Callable[[str, int, int], None]
-"""Told what is being done, how many of it are done, and how many there are."""
+Progress = Callable[[str, int, int], None]  # told what is being done, how many of it are done, and how many there are
 
 
 @dataclass(frozen=True, slots=True)

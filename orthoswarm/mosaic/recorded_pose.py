@@ -26,7 +26,7 @@ from orthoswarm.model.frame import (
 )
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.placement import PlacedFrame
-from orthoswarm.trajectory.courses import MOVED_M, course
+from orthoswarm.trajectory.legs import MOVED_M, course
 
 _USUAL_HEIGHTS_M: Final = (50.0, 150.0)
 """Heights between which mapping flights are flown: where the photos' spacing gives a height."""

@@ -25,15 +25,11 @@ _OUTLIER_ROUNDS: Final = 20  # most rounds of it
 
 @dataclass(frozen=True, slots=True)
 class Gaussian:
-    """Mean and standard deviation of the inliers.
+    """Mean and standard deviation of the inliers."""
 
-    Attributes:
-        mean, sigma: of the inliers. inliers: how many.
-    """
-
-    mean: float
-    sigma: float
-    inliers: int
+    mean: float  # of the inliers
+    sigma: float  # of the inliers
+    inliers: int  # how many
 
 
 def gaussian(samples: Array) -> Gaussian:
@@ -60,8 +56,7 @@ def metres_per_pixel(matches: Matches, centre: tuple[float, float], reach_px: fl
     """Ground sampling distance at the orthogonal centre from two frames of a leg: distance flown / image shift.
 
     Args:
-        matches: between the two pictures.
-        centre: column and row of the orthogonal centre (straight below).
+        matches: between the two pictures. centre: column and row of the orthogonal centre (straight below).
         reach_px: matches farther from the centre are not used, since relief and tilt distort them.
         flown_m: distance between the two frames along the leg's line.
 
@@ -95,27 +90,21 @@ def field_of_view(scale_m: float, width: int, height_m: float, tilt_rad: float =
 
 @dataclass(frozen=True, slots=True)
 class ScaleTask:
-    """A pair of frames of one leg that gives one measurement of the scale.
+    """A pair of frames of one leg that gives one measurement of the scale."""
 
-    Attributes:
-        first, second: indices. flown_m: along the line. height_m: mean height. tilt_rad: mean tilt of the camera.
-    """
-
-    first: int
-    second: int
-    flown_m: float
-    height_m: float
-    tilt_rad: float
+    first: int  # indices
+    second: int  # indices
+    flown_m: float  # along the line
+    height_m: float  # mean height
+    tilt_rad: float  # mean tilt of the camera
 
 
 def choose_pairs(along: Array, height: Array, tilt: Array, members: NDArray[np.integer], count: int) -> list[ScaleTask]:
     """Up to `count` pairs, evenly spread over a leg, with a distance near `_SCALE_PAIR_HEIGHTS` flying heights.
 
     Args:
-        along: float64 (n,), distance along the line of the leg's frames, in flying order.
-        height: float64 (n,), metres.
-        tilt: float64 (n,), radians from straight down.
-        members: (n,), the frames' indices in the vehicle.
+        along: float64 (n,), distance along the line of the leg's frames, in flying order. height: float64 (n,), metres.
+        tilt: float64 (n,), radians from straight down. members: (n,), the frames' indices in the vehicle.
         count: how many pairs.
     """
     n, ratio = len(along), _SCALE_PAIR_HEIGHTS
@@ -151,12 +140,8 @@ def estimate_fov(
     """The field of view (radians) of a camera from pairs of frames, outliers suppressed; None if too few agree.
 
     Args:
-        tasks: pairs.
-        gray: picture i.
-        rotation: float64 (N, 3, 3).
-        size: width and height of the pictures.
-        start_rad: first guess, used only to place the orthogonal centre.
-        matcher: for the pairs.
+        tasks: pairs. gray: picture i. rotation: float64 (N, 3, 3). size: width and height of the pictures.
+        start_rad: first guess, used only to place the orthogonal centre. matcher: for the pairs.
     """
     focal = focal_px(start_rad, size[0])
     found = []

@@ -8,8 +8,7 @@ import numpy as np
 
 from orthoswarm.matchers import Matches, map_matcher
 from orthoswarm.matchers.matcher import Mask
-from orthoswarm.matchers.patch_registration import Registration, apply, register
-from orthoswarm.matchers.second_opinion import LEAST_TILES, TRUSTED_SHARE
+from orthoswarm.matchers.patch_registration import LEAST_TILES, TRUSTED_SHARE, Registration, apply, register
 from orthoswarm.model.arrays import Array, Floats
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import GroundGrid
@@ -33,39 +32,28 @@ _ROOF_SIGMAS: Final = 2.0  # ... if it also differs by more than so many standar
 
 @dataclass(frozen=True, slots=True)
 class PatchTask:
-    """A leg to be registered on the map; small, since it may be sent to another machine.
+    """A leg to be registered on the map; small, since it may be sent to another machine."""
 
-    Attributes:
-        vehicle: id. leg: its number. frames: the leg's frames. cameras: their coarse cameras.
-    """
-
-    vehicle: str
-    leg: int
-    frames: list[Frame]
-    cameras: CameraBlock
+    leg: int  # its number
+    frames: list[Frame]  # the leg's frames
+    cameras: CameraBlock  # their coarse cameras
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PatchFit:
-    """Result of registering a leg's patch on the map.
+    """Result of registering a leg's patch on the map."""
 
-    Attributes:
-        vehicle, leg: which leg. homography: float64 (3, 3), ground by the coarse cameras -> ground on the map, in
-            metres relative to `centre`; None if the leg was not found. centre: (2,), local frame.
-        share: of tiles that agree. rms_m: of their residuals per axis. gsd_m: of the patch.
-        damaged: image -> why it could not be used. cpu_s, wall_s: what the task took.
-    """
-
-    vehicle: str
-    leg: int
+    leg: int  # which leg
+    # float64 (3, 3), ground by the coarse cameras -> ground on the map, in metres relative to `centre`; None if the leg
+    # was not found
     homography: Array | None
-    centre: Array
-    share: float
-    rms_m: float
-    gsd_m: float
-    damaged: dict[str, str]
-    cpu_s: float
-    wall_s: float
+    centre: Array  # (2,), local frame
+    share: float  # of tiles that agree
+    rms_m: float  # of their residuals per axis
+    gsd_m: float  # of the patch
+    damaged: dict[str, str]  # image -> why it could not be used
+    cpu_s: float  # what the task took
+    wall_s: float  # what the task took
 
     def move(self, ground: Array) -> Array:
         """Corrected ground points (N, 2), local frame."""
@@ -104,17 +92,11 @@ def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: 
                 homography = in_metres(found.homography, own, there, centre)
                 break
     return PatchFit(
-        vehicle=task.vehicle,
-        leg=task.leg,
-        homography=homography,
-        centre=centre,
-        share=0.0 if found is None else found.share,
-        rms_m=float("nan") if found is None else found.rms_px * gsd,
-        gsd_m=gsd,
-        damaged={task.frames[i].image: why for i, why in pictures.damaged.items()},
-        cpu_s=process_time() - began,
+        leg=task.leg, homography=homography, centre=centre, share=0.0 if found is None else found.share,
+        rms_m=float("nan") if found is None else found.rms_px * gsd, gsd_m=gsd,
+        damaged={task.frames[i].image: why for i, why in pictures.damaged.items()}, cpu_s=process_time() - began,
         wall_s=perf_counter() - clock,
-    )
+    )  # fmt: skip
 
 
 def patch_gsd(cameras: CameraBlock, map_gsd_m: float) -> float:
@@ -161,14 +143,11 @@ class HeightFilter:
     its distance from the nadir point and H the flying height (relief displacement). The residual of a match along that
     direction gives an apparent height; matches far from the median height are rejected. Near the nadir points the
     displacement vanishes and no match is rejected.
-
-    Attributes:
-        cameras: the leg's cameras. own: grid of the patch. there: grid of the window.
     """
 
-    cameras: CameraBlock
-    own: GroundGrid
-    there: GroundGrid
+    cameras: CameraBlock  # the leg's cameras
+    own: GroundGrid  # grid of the patch
+    there: GroundGrid  # grid of the window
 
     def __call__(self, matches: Matches, homography: Array) -> Mask:
         """Which matches to keep, bool (N,)."""

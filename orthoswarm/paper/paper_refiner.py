@@ -15,7 +15,6 @@ import numpy as np
 from orthoswarm.model.arrays import Array
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.frame import Frame
-from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Leg, LegState, MapWindow, PlacedFrame, Refinement, Solution, Stage
 from orthoswarm.model.task_runner import Progress, Run, serial
 from orthoswarm.paper.coarse_cameras import RECEIVER_SIGMA_M, CoarseVehicle, PaperOptions, coarse_vehicle
@@ -28,38 +27,22 @@ _CARRIED_SIGMA_M: Final = 2.0  # least sigma of a correction carried from other 
 
 @dataclass(frozen=True, slots=True)
 class PaperState:
-    """What a solved unit passes on to later calls.
+    """What a solved unit passes on to later calls."""
 
-    Attributes:
-        found: centre and shift of each leg that was found on the map, for neighbours. frames: those that were placed.
-    """
-
-    found: list[tuple[Array, Array]]
-    frames: list[Frame]
+    found: list[tuple[Array, Array]]  # centre and shift of each leg that was found on the map, for neighbours
+    frames: list[Frame]  # those that were placed
 
 
 @dataclass(frozen=True, slots=True)
 class PaperRefiner(UnitRefiner):
-    """The paper's refiner behind the interface `placement.Refiner`.
+    """The paper's refiner behind the interface `placement.Refiner`."""
 
-    Attributes:
-        options: see PaperOptions.
-    """
-
-    options: PaperOptions = field(default_factory=PaperOptions)
+    options: PaperOptions = field(default_factory=PaperOptions)  # see PaperOptions
 
     def solve(self, units: list[list[Frame]], neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
         """All steps for one vehicle; if none of its legs is found on the map, it gets its neighbours' correction."""
-        return _refine(
-            units,
-            [pair for n in neighbours for pair in _found(n)],
-            basemap,
-            grid=LocalGrid(self.epsg),
-            origin=self.origin,
-            options=self.options,
-            run=serial,
-            progress=None,
-        ).fine[0]
+        from_neighbours = [pair for n in neighbours for pair in _found(n)]
+        return self._refined(units, from_neighbours, basemap).fine[0]
 
     def again(self, solution: Solution, neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
         """Place a vehicle again with later neighbours; changes only a vehicle with no leg of its own on the map."""
@@ -82,67 +65,51 @@ class PaperRefiner(UnitRefiner):
         halo: Collection[str] = (),
     ) -> Refinement:
         """Place all vehicles of an area (placement.Refiner), those of the halo as all; the paper's ground is flat."""
-        grid, units = LocalGrid(self.epsg), units_of_area(vehicles)
-        return _refine(
-            units, [], basemap, grid=grid, origin=self.origin, options=self.options, run=run, progress=progress
-        )
+        return self._refined(units_of_area(vehicles), [], basemap, run, progress)
+
+    def _refined(
+        self, units: Sequence[Sequence[Frame]], from_neighbours: Sequence[tuple[Array, Array]],
+        basemap: MapWindow | None, run: Run = serial, progress: Progress | None = None,
+    ) -> Refinement:  # fmt: skip
+        clock = perf_counter()
+        first = partial(_timed_coarse, epsg=self.epsg, origin=self.origin, options=self.options)
+        coarse: list[CoarseVehicle] = []
+        tasks_s: dict[str, list[float]] = {"vehicles (III.C)": [], "legs (III.D)": []}
+        parallel_s = -perf_counter()
+        for n, (vehicle, seconds) in enumerate(run(first, units)):
+            coarse.append(vehicle)
+            tasks_s["vehicles (III.C)"].append(seconds)
+            if progress:
+                progress("lines and fields of view", n + 1, len(units))
+        parallel_s += perf_counter()
+        fits: list[dict[int, PatchFit]] = [{} for _ in coarse]
+        if basemap is not None:
+            tasks = []
+            for u, vehicle in enumerate(coarse):
+                for k in range(len(vehicle.lines)):
+                    if len(members := vehicle.members(k)):
+                        frames = [vehicle.frames[i] for i in members]
+                        tasks.append((u, PatchTask(k, frames, vehicle.cameras.take(members))))
+            second = partial(match_patch, basemap=basemap, origin=self.origin, options=self.options)
+            parallel_s -= perf_counter()
+            for n, fit in enumerate(run(second, [t for _, t in tasks])):
+                fits[tasks[n][0]][fit.leg] = fit
+                tasks_s["legs (III.D)"].append(fit.wall_s)
+                if progress:
+                    progress("legs on the map", n + 1, len(tasks))
+            parallel_s += perf_counter()
+        found = (fit for own in fits for fit in own.values() if fit.homography is not None)
+        everyone = [*from_neighbours, *((fit.centre, fit.shift) for fit in found)]
+        stage: Stage = "fine" if basemap is not None else "coarse"
+        before = [_solution(v, {}, [], self.origin, "coarse") for v in coarse]
+        after = [_solution(v, own, everyone, self.origin, stage) for v, own in zip(coarse, fits, strict=True)]
+        fine = merge_units(after)
+        wall_s = perf_counter() - clock
+        return Refinement(merge_units(before), fine, None, [], _equation_5(tasks_s, wall_s - parallel_s, wall_s))
 
 
 def _found(solution: Solution) -> list[tuple[Array, Array]]:
     return [pair for state in unit_states(solution) for pair in state.found]
-
-
-def _refine(
-    units: Sequence[Sequence[Frame]],
-    from_neighbours: Sequence[tuple[Array, Array]],
-    basemap: MapWindow | None,
-    *,
-    grid: LocalGrid,
-    origin: Array,
-    options: PaperOptions,
-    run: Run,
-    progress: Progress | None,
-) -> Refinement:
-    clock = perf_counter()
-    first = partial(_timed_coarse, epsg=grid.epsg, origin=origin, options=options)
-    coarse, tasks_s = [], {"vehicles (III.C)": [], "legs (III.D)": []}  # type: tuple[list[CoarseVehicle], dict[str, list[float]]]
-    parallel_s = -perf_counter()
-    for n, (vehicle, seconds) in enumerate(run(first, units)):
-        coarse.append(vehicle)
-        tasks_s["vehicles (III.C)"].append(seconds)
-        if progress:
-            progress("lines and fields of view", n + 1, len(units))
-    parallel_s += perf_counter()
-    fits: list[dict[int, PatchFit]] = [{} for _ in coarse]
-    if basemap is not None:
-        tasks = [(u, _task(v, k)) for u, v in enumerate(coarse) for k in range(len(v.lines)) if len(v.members(k))]
-        second = partial(match_patch, basemap=basemap, origin=origin, options=options)
-        parallel_s -= perf_counter()
-        for n, fit in enumerate(run(second, [t for _, t in tasks])):
-            fits[tasks[n][0]][fit.leg] = fit
-            tasks_s["legs (III.D)"].append(fit.wall_s)
-            if progress:
-                progress("legs on the map", n + 1, len(tasks))
-        parallel_s += perf_counter()
-    everyone = [
-        *from_neighbours,
-        *((f.centre, f.shift) for own in fits for f in own.values() if f.homography is not None),
-    ]
-    before = [_solution(v, {}, [], origin=origin, stage="coarse", had_map=False) for v in coarse]
-    after = [
-        _solution(
-            v,
-            own,
-            everyone,
-            origin=origin,
-            stage="fine" if basemap is not None else "coarse",
-            had_map=basemap is not None,
-        )
-        for v, own in zip(coarse, fits, strict=True)
-    ]
-    fine = merge_units(after)
-    wall_s = perf_counter() - clock
-    return Refinement(merge_units(before), fine, None, [], _equation_5(tasks_s, wall_s - parallel_s, wall_s))
 
 
 def _equation_5(tasks_s: Mapping[str, Sequence[float]], sequential_s: float, wall_s: float) -> dict[str, float]:
@@ -170,20 +137,10 @@ def _timed_coarse(
     return coarse_vehicle(frames, epsg=epsg, origin=origin, options=options), perf_counter() - clock
 
 
-def _task(vehicle: CoarseVehicle, leg: int) -> PatchTask:
-    members = vehicle.members(leg)
-    return PatchTask(vehicle.vehicle, leg, [vehicle.frames[i] for i in members], vehicle.cameras.take(members))
-
-
 def _solution(
-    vehicle: CoarseVehicle,
-    fits: Mapping[int, PatchFit],
-    everyone: Sequence[tuple[Array, Array]],
-    *,
-    origin: Array,
+    vehicle: CoarseVehicle, fits: Mapping[int, PatchFit], everyone: Sequence[tuple[Array, Array]], origin: Array,
     stage: Stage,
-    had_map: bool,
-) -> Solution:
+) -> Solution:  # fmt: skip
     """Cameras of all frames: by the homography of their leg, or by interpolated corrections where it was not found."""
     began = process_time()
     dropped = {vehicle.frames[i].image: why for i, why in vehicle.damaged.items()}
@@ -203,10 +160,9 @@ def _solution(
             pixels = pixel_grid(camera)
             ground = camera.to_ground(pixels)
             if np.isfinite(ground).all():
-                pose = fit_camera(camera, found.move(ground), pixels)
-                camera = pose.camera
+                camera, rms_m = fit_camera(camera, found.move(ground), pixels)
                 line = vehicle.lines[int(vehicle.leg[i])].sigma_m  # along the line the records are as rough as across
-                sigmas[i] = np.sqrt(found.rms_m**2 + line**2 / 2 + pose.rms_m**2)
+                sigmas[i] = np.sqrt(found.rms_m**2 + line**2 / 2 + rms_m**2)
         elif shift is not None:
             camera = replace(camera, position=camera.position + np.array([*shift[i], 0.0]))
             sigmas[i] = np.hypot(
@@ -215,26 +171,18 @@ def _solution(
         camera = replace(camera, position=camera.position + np.array([*origin, 0.0]))
         placed.append(PlacedFrame(frame, camera, stage if on_map or stage == "coarse" else "coarse", float(sigmas[i])))
     warnings = list(vehicle.warnings)
-    if had_map and not matched:
+    if stage == "fine" and not matched:
         how = "neighbours carry it" if shift is not None else "it lies in the GPS frame"
         warnings.append(f"no leg of this flight was found on the map; {how}")
     state = PaperState([(f.centre, f.shift) for f in matched.values()], [p.frame for p in placed])
     timings = {"relative": vehicle.cpu_s, "patches": sum(f.cpu_s for f in fits.values())}
     timings["cameras"] = process_time() - began
     return Solution(
-        vehicle=vehicle.vehicle,
-        placed=placed,
-        dropped=dropped,
-        legs=_legs(vehicle, fits, sigmas, shift is not None),
+        vehicle=vehicle.vehicle, placed=placed, dropped=dropped, legs=_legs(vehicle, fits, sigmas, shift is not None),
         fov_deg=float(np.degrees(vehicle.cameras.camera(0, origin).lens.fov_rad)),
-        fov_sigma_deg=float(np.degrees(vehicle.fov_sigma_rad)),
-        terrain=None,
-        ground_z_m=0.0,
-        map_lean=(0.0, 0.0),
-        state=state,
-        warnings=warnings,
-        timings=timings,
-    )
+        fov_sigma_deg=float(np.degrees(vehicle.fov_sigma_rad)), terrain=None, ground_z_m=0.0, map_lean=(0.0, 0.0),
+        state=state, warnings=warnings, timings=timings,
+    )  # fmt: skip
 
 
 def _carried(
@@ -276,16 +224,11 @@ def _legs(vehicle: CoarseVehicle, fits: Mapping[int, PatchFit], sigma: Array, ca
 _POSE_ROUNDS: Final = 6  # most Gauss-Newton steps of the pose that reproduces a homography best
 
 
-@dataclass(frozen=True, slots=True)
-class CorrectedCamera:
-    """A corrected camera and the rms of the residuals of its ground points, metres."""
+def fit_camera(camera: Camera, corrected: Array, pixels: Array) -> tuple[Camera, float]:
+    """Space resection by Gauss-Newton: the pose that images ground points (N, 2) at height 0 at pixels (N, 2).
 
-    camera: Camera
-    rms_m: float
-
-
-def fit_camera(camera: Camera, corrected: Array, pixels: Array) -> CorrectedCamera:
-    """Space resection by Gauss-Newton: the pose that images ground points (N, 2) at height 0 at pixels (N, 2)."""
+    Returns the camera and the rms of the residuals of its ground points, metres.
+    """
     points = np.c_[corrected, np.zeros(len(corrected))]
     position = camera.position + np.array([*(corrected - camera.to_ground(pixels)).mean(axis=0), 0.0])
     current = Camera(position, camera.rotation, camera.lens)
@@ -293,7 +236,9 @@ def fit_camera(camera: Camera, corrected: Array, pixels: Array) -> CorrectedCame
         projected = current.project(points)
         jacobian = np.empty((2 * len(points), 6))
         for k in range(6):
-            jacobian[:, k] = ((_moved(current, k, 1e-5).project(points) - projected) / 1e-5).ravel()
+            change = np.zeros(6)
+            change[k] = 1e-5
+            jacobian[:, k] = ((_apply_step(current, change).project(points) - projected) / 1e-5).ravel()
         step, *_ = np.linalg.lstsq(jacobian, (pixels - projected).ravel(), rcond=None)
         if not np.isfinite(step).all():
             break
@@ -301,7 +246,7 @@ def fit_camera(camera: Camera, corrected: Array, pixels: Array) -> CorrectedCame
         if np.abs(step).max() < 1e-7:
             break
     error = current.to_ground(pixels) - corrected
-    return CorrectedCamera(current, float(np.sqrt((error**2).sum(1).mean())))
+    return current, float(np.sqrt((error**2).sum(1).mean()))
 
 
 def pixel_grid(camera: Camera, columns: int = 6, rows: int = 5) -> Array:
@@ -314,20 +259,12 @@ def pixel_grid(camera: Camera, columns: int = 6, rows: int = 5) -> Array:
 def carried_shift(index: Array, matched: Sequence[tuple[float, Array]]) -> Array:
     """Corrections (N, 2) of frames between matched legs of the same vehicle, interpolated by frame number.
 
-    Args:
-        index: float64 (N,), frame numbers.
-        matched: middle frame number and shift (2,) of each leg that was found.
+    index: float64 (N,), frame numbers. matched: middle frame number and shift (2,) of each leg that was found.
     """
     order = sorted(matched, key=lambda m: m[0])
     at = np.array([m[0] for m in order])
     shift = np.array([m[1] for m in order])
     return np.column_stack([np.interp(index, at, shift[:, k]) for k in range(2)])
-
-
-def _moved(camera: Camera, k: int, step: float) -> Camera:
-    change = np.zeros(6)
-    change[k] = step
-    return _apply_step(camera, change)
 
 
 def _apply_step(camera: Camera, step: Array) -> Camera:

@@ -42,16 +42,11 @@ _EDGE_ROUNDS: Final = 12  # bisections of the highest ground between two places 
 
 @dataclass(frozen=True)
 class _Over:
-    """What a plan's flights lie over.
+    """What a plan's flights lie over."""
 
-    Attributes:
-        above_m: height above level ground at which `foot` was made. foot: footprint of the narrowest camera.
-        heights: of the flights.
-    """
-
-    above_m: float
-    foot: Footprint
-    heights: FlightHeights
+    above_m: float  # height above level ground at which `foot` was made
+    foot: Footprint  # footprint of the narrowest camera
+    heights: FlightHeights  # of the flights
 
     def missed(self, wanted: planned_coverage.Geometry, slots: list[list[Slot]]) -> planned_coverage.Geometry:
         """What of the wanted ground no picture is certain to see, a shapely geometry."""
@@ -65,8 +60,7 @@ class _Over:
     def checked(self, slots: list[list[Slot]]) -> OverGround | None:
         """How the flights lie over the height model, None without one.
 
-        Raises:
-            InputError: lower than `heights.least_above_m` above it.
+        Raises InputError: lower than `heights.least_above_m` above it.
         """
         if self.heights.ground is None:
             return None
@@ -87,14 +81,10 @@ def plan_area(
     """Missions that cover an area.
 
     Args:
-        area: ground and no-fly zones.
-        vehicles: how many.
+        area: ground and no-fly zones. vehicles: how many.
         altitude_m: height of the legs above takeoff, metres; with `heights`, that above level ground at which `foot`
-            was made.
-        foot: footprint of the narrowest camera at that height.
-        method: how lines are laid and ordered.
-        options: the rest.
-        progress: called with what is being done.
+            was made. foot: footprint of the narrowest camera at that height. method: how lines are laid and ordered.
+        options: the rest. progress: called with what is being done.
         heights: of the flights over a height model; None for level ground at takeoff.
 
     Raises:
@@ -117,14 +107,8 @@ def plan_area(
 
     progress("lines")
     best = _best_work(
-        area,
-        swarm,
-        foot,
-        method=method,
-        options=options,
-        router=router,
-        reach_m=min(foot.reach_m, 2.0 * clearance_m),
-    )
+        area, swarm, foot, method=method, options=options, router=router, reach_m=min(foot.reach_m, 2.0 * clearance_m),
+    )  # fmt: skip
     return _plan(
         method, best, swarm, over, grid=area.grid, options=options, progress=progress, area=area, said=incomplete
     )
@@ -250,8 +234,7 @@ def plan_lines(
 
     Args:
         lines: float64 (n, 2) each, latitude and longitude in degrees, flown in the order given. Stretches shorter
-            than two trigger distances are flown without pictures: they are turns.
-        vehicles: how many share the lines.
+            than two trigger distances are flown without pictures: they are turns. vehicles: how many share the lines.
         no_fly: an area whose no-fly zones hold here, too.
 
     Raises:
@@ -342,16 +325,10 @@ def _sortie(slot: Slot, foot: Footprint, grid: LocalGrid, motion: Motion) -> Sor
     )
     length = np.hypot(*np.diff(_legs_of(flight), axis=1)[:, 0].T)
     return Sortie(
-        home_lat_deg=float(home[0]),
-        home_lon_deg=float(home[1]),
-        takeoff_height_m=flight.climb_m - flight.home_z_m,
-        waypoints=waypoints,
-        start_s=slot.start_s,
-        time_s=flight.time_s(motion),
-        length_m=flight.length_m,
-        turns=flight.turns,
-        photos=int((length / foot.trigger_m + 1e-6).astype(int).sum()) + len(length),
-    )
+        home_lat_deg=float(home[0]), home_lon_deg=float(home[1]), takeoff_height_m=flight.climb_m - flight.home_z_m,
+        waypoints=waypoints, start_s=slot.start_s, time_s=flight.time_s(motion), length_m=flight.length_m,
+        turns=flight.turns, photos=int((length / foot.trigger_m + 1e-6).astype(int).sum()) + len(length),
+    )  # fmt: skip
 
 
 def _plan(
@@ -388,23 +365,13 @@ def _plan(
         for number, row in enumerate(schedule.slots, start=1)
     )
     return Plan(
-        method=method,
-        vehicles=made,
-        altitude_m=level_m,
-        speed_m_s=options.motion.speed_m_s,
-        trigger_m=foot.trigger_m,
-        spacing_m=foot.spacing_m,
-        footprint_m=(foot.width_m, foot.height_m),
-        end=options.end,
-        epsg=grid.epsg,
-        area_m2=area_m2,
-        covered_share=share,
-        gaps=gaps,
-        separation=_separation_text(schedule, level_m, options.separation),
-        warnings=tuple(warnings),
+        method=method, vehicles=made, altitude_m=level_m, speed_m_s=options.motion.speed_m_s, trigger_m=foot.trigger_m,
+        spacing_m=foot.spacing_m, footprint_m=(foot.width_m, foot.height_m), end=options.end, epsg=grid.epsg,
+        area_m2=area_m2, covered_share=share, gaps=gaps,
+        separation=_separation_text(schedule, level_m, options.separation), warnings=tuple(warnings),
         over_ground=over.checked(schedule.slots),
         apart=Apart(options.separation.distance_m, options.separation.height_m),
-    )
+    )  # fmt: skip
 
 
 def _separation_text(schedule: Schedule, altitude_m: float, apart: Separation) -> str:
@@ -458,8 +425,7 @@ def _sampled(path: Array, *grounds: Terrain) -> Array:
 def _half_widths(points: Array, ground: Terrain, slope: float) -> tuple[Array, Array]:
     """How far pictures reach to the left and to the right of a leg's points (n, 3), metres; and the unit vector left.
 
-    Args:
-        slope: half a footprint's width over the height above ground.
+    slope: half a footprint's width over the height above ground.
     """
     way = points[-1, :2] - points[0, :2]
     left = np.array([-way[1], way[0]]) / max(float(np.hypot(*way)), 1e-9)
@@ -519,13 +485,7 @@ def over_ground(flights: Sequence[Flight], heights: FlightHeights, foot: Footpri
     forward = 1.0 - foot.trigger_m / (foot.height_m * float(above.min()) / foot_above_m)
     top = max(float(flight.track()[:, 2].max()) - flight.home_z_m for flight in flights)
     return OverGround(
-        follows=heights.follows,
-        by_vehicle=heights.by_vehicle,
-        nominal_m=heights.above_m,
-        least_m=float(above.min()),
-        most_m=float(above.max()),
-        way_least_m=least,
-        top_m=top,
-        side_overlap=(float(np.percentile(overlap, 5)), float(np.median(overlap))),
-        forward_overlap=forward,
-    )
+        follows=heights.follows, by_vehicle=heights.by_vehicle, nominal_m=heights.above_m, least_m=float(above.min()),
+        most_m=float(above.max()), way_least_m=least, top_m=top,
+        side_overlap=(float(np.percentile(overlap, 5)), float(np.median(overlap))), forward_overlap=forward,
+    )  # fmt: skip

@@ -25,22 +25,15 @@ _CLOSER_ROUNDS: Final = 4  # most such rounds (time)
 
 @dataclass(frozen=True, slots=True)
 class GroundBelow:
-    """The ground below a plan, metres over the lowest takeoff.
+    """The ground below a plan, metres over the lowest takeoff."""
 
-    Attributes:
-        terrain: its heights. highest: the highest ground up to `BESIDE_M` from each place.
-        low_m: lowest ground of the area; high_m: highest.
-        way_m: highest ground of the area, of the ways to it, and beside them.
-        least_above_m: least height of a flight over the highest ground below it.
-    """
-
-    terrain: Terrain
-    highest: Terrain
-    low_m: float
-    high_m: float
-    way_m: float
+    terrain: Terrain  # its heights
+    highest: Terrain  # the highest ground up to `BESIDE_M` from each place
+    low_m: float  # lowest ground of the area
+    high_m: float  # highest
+    way_m: float  # highest ground of the area, of the ways to it, and beside them
     _: KW_ONLY
-    least_above_m: float = PLANNING.least_above_ground_m
+    least_above_m: float = PLANNING.least_above_ground_m  # least height of a flight over the highest ground below it
 
 
 def plan_over_relief(
@@ -93,13 +86,9 @@ def plan_over_relief(
             )
         kept_m = min(tolerance_m, _BY_VEHICLE_M) if by_vehicle else tolerance_m
         heights = GroundHeights(
-            ground=ground.terrain,
-            highest=ground.highest,
-            above_m=above_m,
-            tolerance_m=kept_m,
-            by_vehicle=by_vehicle,
+            ground=ground.terrain, highest=ground.highest, above_m=above_m, tolerance_m=kept_m, by_vehicle=by_vehicle,
             least_above_m=kept_above_m,
-        )
+        )  # fmt: skip
         plans.append(_closely_enough(make, lens, heights, least_m))
     if relief != "follow" and level_fits:
         level = LevelHeights(

@@ -5,13 +5,14 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import Any, Final
-from xml.sax.saxutils import escape
 
 import numpy as np
 
 from orthoswarm import __version__
+from orthoswarm.change.change_files import figures_in, overlay_pixels
 from orthoswarm.export.atomic_file import write_file
 from orthoswarm.export.catalog.tiled_raster import product_file
 from orthoswarm.export.product_files import iso_time
@@ -56,12 +57,14 @@ PALETTE = (
 """Colours that stay apart on photographs and in print: five of Okabe and Ito's, and others that differ from all before
 by at least 16 (CIE 1976), also as seen without red, green or blue cones (Machado and others 2009)."""
 _LEGS = {"matched": (0, 158, 115), "carried": (230, 159, 0), "failed": (163, 32, 13)}
-_LEG_WIDTHS = {"matched": 2, "carried": 4, "failed": 7}
-"""Pixels: which is which can be seen without the colours."""
+_LEG_WIDTHS = {"matched": 2, "carried": 4, "failed": 7}  # pixels: which is which can be seen without the colours
 
 _LEAST_PICTURE_PX: Final = 200
 """Side that pictures of the report have at least where a map's pixel is large (one of 640 m would leave nothing to
 see)."""
+_BEGIN, _END = "<!-- change -->", "<!-- /change -->"
+_WIDTH_PX: Final = 900
+_SHOWN: Final = 0.5  # probability from which ground is painted
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,11 +88,8 @@ def write_page(
     """Write report.html beside the products.
 
     Args:
-        out: output folder with the products.
-        report: content of report.json.
-        placed: the frames as last placed.
-        rejected: the pictures that were left out.
-        basemap: the map, if there is one.
+        out: output folder with the products. report: content of report.json. placed: the frames as last placed.
+        rejected: the pictures that were left out. basemap: the map, if there is one.
         cells: picture of the cells of the coverage (PNG), empty without one.
 
     Returns:
@@ -493,3 +493,42 @@ def _colour(name: str, index: int) -> str:
 def _round_step(value: float) -> float:
     unit = 10.0 ** np.floor(np.log10(max(value, 1e-6)))
     return float(next(s for s in (1, 2, 5, 10) if s * unit >= value) * unit)
+
+
+def put_section(folder: Path, change: Path) -> bool:
+    """Put the change map of a folder into report.html of a map, in the place of an earlier one; False without a report.
+
+    Raises OrthoSwarmError: the disk is full.
+    """
+    report, figures = folder / "report.html", figures_in(change)
+    orthoimage = product_file(folder, "orthoimage.tif")
+    if not report.is_file() or figures is None or orthoimage is None:
+        return False
+    before, begin, rest = report.read_text(encoding="utf-8").partition(_BEGIN)
+    _, end, after = rest.partition(_END)
+    if not begin or not end:
+        return False
+    grid = view_grid(figures["epsg"], product_bounds(orthoimage), _WIDTH_PX)
+    picture = pale(product_picture(orthoimage, grid), 0.5)
+    paint, _ = overlay_pixels(change, _SHOWN, tuple(grid.bounds), (grid.height, grid.width))
+    share = paint[..., 3:] / 255.0
+    picture.rgb[:] = np.round(picture.rgb * (1.0 - share) + paint[..., :3] * share)
+    scale_bar(picture)
+    rows = "".join(
+        f"<tr><td>{row['area_m2']:,.0f} m²</td><td>{escape(row['kind'])}</td><td>{row['probability']:.0%}</td>"
+        f"<td>{row['lat_deg']:.6f}, {row['lon_deg']:.6f}</td>"
+        f"<td>{escape(', '.join(photo['image'] for photo in row['photos'][:1]))}</td></tr>"
+        for row in figures["largest"]
+    )
+    text = (
+        f"{figures['changed_share']:.1%} of the ground differs from {escape(figures['basemap'])} with a probability of "
+        f"at least one half; {figures['not_visible_share']:.1%} could not be compared (grey). Yellow is likely, red "
+        "certain. Cells and polygons with photos: change.tif and change.gpkg."
+    )
+    table = "<table><tr><th>area</th><th>kind</th><th>probability</th><th>place</th><th>photo</th></tr>" + rows
+    section = (
+        f'<figure id="change"><h2>What changed</h2><img src="{data_uri(picture.rgb)}" alt="ground that changed">'
+        f"<figcaption>{text}</figcaption>{table + '</table>' if rows else ''}</figure>"
+    )
+    write_file(report, before + begin + section + end + after)
+    return True

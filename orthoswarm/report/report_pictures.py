@@ -27,17 +27,11 @@ _LIGHT = np.array([-1.0, 1.0, 1.4]) / np.sqrt(1.0 + 1.0 + 1.4**2)
 
 @dataclass(slots=True)
 class Picture:
-    """Colours on the ground.
+    """Colours on the ground."""
 
-    Attributes:
-        rgb: uint8 (rows, columns, 3), empty ground in the page's colour.
-        seen: bool (rows, columns), where there is something.
-        grid: where it lies.
-    """
-
-    rgb: Bytes
-    seen: Flags
-    grid: GroundGrid
+    rgb: Bytes  # uint8 (rows, columns, 3), empty ground in the page's colour
+    seen: Flags  # bool (rows, columns), where there is something
+    grid: GroundGrid  # where it lies
 
     def on(self, grid: GroundGrid) -> "Picture":
         """Resampled to another grid, as far as it reaches."""
@@ -217,11 +211,7 @@ def relief(height_m: NDArray[np.floating[Any]], cell_m: float) -> Bytes:
 
 
 def surface_picture(surface: Mapping[str, Any]) -> tuple[Bytes, str]:
-    """The picture of a surface model, and what it shows.
-
-    Args:
-        surface: `surface` of report.json.
-    """
+    """The picture of a surface model, and what it shows. surface: `surface` of report.json."""
     import rasterio
     from rasterio.enums import Resampling
 
@@ -269,17 +259,11 @@ _BAND_PX: Final = 500_000  # pixels that are compared at once (memory: gradients
 
 @dataclass(frozen=True, slots=True)
 class Moved:
-    """Where blocks of the map are found in the orthoimage.
+    """Where blocks of the map are found in the orthoimage."""
 
-    Attributes:
-        at: float64 (K, 2), places in the orthoimage, on the ground.
-        shift: float64 (K, 2), from there to the same thing in the map, metres.
-        blocks: how many blocks were tried.
-    """
-
-    at: Array
-    shift: Array
-    blocks: int
+    at: Array  # float64 (K, 2), places in the orthoimage, on the ground
+    shift: Array  # float64 (K, 2), from there to the same thing in the map, metres
+    blocks: int  # how many blocks were tried
 
     @classmethod
     def joined(cls, parts: "Sequence[Moved]") -> "Moved":
@@ -300,22 +284,14 @@ def moved(ortho: Bytes, seen: Flags, basemap: Bytes, valid: Flags, grid: GroundG
     than a wrong one.
 
     Args:
-        ortho: grey orthoimage (rows, columns).
-        seen: where it is drawn.
-        basemap: grey map on the same grid.
-        valid: where the map means something.
-        grid: of both.
+        ortho: grey orthoimage (rows, columns). seen: where it is drawn. basemap: grey map on the same grid.
+        valid: where the map means something. grid: of both.
     """
     step = max(_BLOCK_PX, float(np.sqrt(seen.sum() / _MOST_BLOCKS)))
     settings = FieldSettings(
-        gsd_m=grid.gsd_m,
-        block_m=_BLOCK_PX * grid.gsd_m,
-        step_m=step * grid.gsd_m,
-        search_m=_SEARCH_PX * grid.gsd_m,
-        apart_m=_APART_PX * grid.gsd_m,
-        min_cover=_LEAST_COVER,
-        min_peak=_LEAST_PEAK,
-    )
+        gsd_m=grid.gsd_m, block_m=_BLOCK_PX * grid.gsd_m, step_m=step * grid.gsd_m, search_m=_SEARCH_PX * grid.gsd_m,
+        apart_m=_APART_PX * grid.gsd_m, min_cover=_LEAST_COVER, min_peak=_LEAST_PEAK,
+    )  # fmt: skip
     field = Displacements.joined(list(_fields(ortho, seen, basemap, valid, settings)))
     found = field.matched
     shift = field.shift_m[found]

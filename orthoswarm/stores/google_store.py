@@ -31,8 +31,7 @@ class EndedLoginError(PermissionError):
 class GoogleFileSystem(GCSFileSystem):  # type: ignore[misc]
     """The file system of `gs://`: a failure is raised at once, and its type tells what it is.
 
-    Args:
-        settings: as for gcsfs.
+    settings: as for gcsfs.
     """
 
     _get_file_request = inspect.unwrap(GCSFileSystem._get_file_request)

@@ -16,20 +16,15 @@ from orthoswarm.stores.addresses import address_of, is_stored
 from orthoswarm.stores.requests import NotStoredError, RefusedError, request
 
 MANIFEST = "files.txt"
-_SERVER_PARTS = 3
-"""Parts of the path of a server itself: root, scheme, host."""
+_SERVER_PARTS = 3  # parts of the path of a server itself: root, scheme, host
 
 
 @dataclass(frozen=True, slots=True)
 class StoredFile:
-    """A file in a store.
+    """A file in a store."""
 
-    Attributes:
-        size: bytes, None where the store does not tell. version: changes with the content.
-    """
-
-    size: int | None
-    version: str
+    size: int | None  # bytes, None where the store does not tell
+    version: str  # changes with the content
 
 
 _known: dict[Path, StoredFile] = {}
@@ -48,8 +43,7 @@ def remember(sizes: Mapping[Path, StoredFile]) -> None:
 def look_up(path: Path) -> StoredFile:
     """Size and version of one file, as they are now.
 
-    Raises:
-        NotStoredError: if it is not there. Else see `requests.request`.
+    Raises NotStoredError: if it is not there. Else see `requests.request`.
     """
     info = request(path, lambda system, key: system.info(key))
     if info.get("type") == "directory":
@@ -62,8 +56,7 @@ def look_up(path: Path) -> StoredFile:
 def list_folder(folder: Path) -> list[Path]:
     """All files below a folder in a store, in the order of their paths; empty if there are none.
 
-    Raises:
-        OrthoSwarmError: see `requests.request`.
+    Raises OrthoSwarmError: see `requests.request`.
     """
     if folder.parts[1].startswith("http"):
         return sorted(_web_folder(folder))
@@ -78,8 +71,7 @@ def list_folder(folder: Path) -> list[Path]:
 def exists(path: Path) -> bool:
     """Whether there is a file or folder, local or in a store.
 
-    Raises:
-        InputError: if its store refuses to tell. Else see `requests.request`.
+    Raises InputError: if its store refuses to tell. Else see `requests.request`.
     """
     if not is_stored(path):
         return path.exists()

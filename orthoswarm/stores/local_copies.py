@@ -46,8 +46,7 @@ def compare_from_now() -> None:
 
     It concerns this process and those that it starts from now on.
 
-    Raises:
-        InputError: the environment gives no size for the cache.
+    Raises InputError: the environment gives no size for the cache.
     """
     cache_bytes()
     os.environ[_COMPARE_VARIABLE] = str(time.time())
@@ -78,11 +77,7 @@ def cache_folder() -> Path:
 
 
 def cache_bytes() -> float:
-    """How much copies may take on this machine.
-
-    Raises:
-        InputError: the environment gives no number above 0.
-    """
+    """How much copies may take on this machine. Raises InputError: the environment gives no number above 0."""
     said = os.environ.get(SIZE_VARIABLE) or _CACHE_MB
     try:
         limit = 1e6 * float(said)
@@ -132,8 +127,7 @@ class Ahead:
 
     Threads end when nothing is announced any more. What is wanted before its turn is left to the one who wants it.
 
-    Args:
-        copy: copies one; raises nothing that matters, since whoever wants the file copies it again and finds out.
+    copy: copies one; raises nothing that matters, since whoever wants the file copies it again and finds out.
     """
 
     def __init__(self, copy: Callable[[Path], object]) -> None:
@@ -183,8 +177,7 @@ _ahead = Ahead(_copied)
 def content(path: Path) -> bytes:
     """The bytes of a file, local or in a store.
 
-    Raises:
-        OSError: if a local file cannot be read. Else see `local_file`.
+    Raises OSError: if a local file cannot be read. Else see `local_file`.
     """
     while True:
         try:

@@ -36,9 +36,7 @@ class PublishedFolder:
     Attributes:
         address: where the map is to lie. local: the folder to write to, of the same name.
 
-    Raises:
-        InputError: if nothing can be written at the address.
-        StoreLostError: if the store cannot be reached.
+    Raises InputError: if nothing can be written at the address; StoreLostError: if the store cannot be reached.
     """
 
     def __init__(self, address: Path) -> None:
@@ -52,8 +50,7 @@ class PublishedFolder:
 
         Args:
             written: whether runs write files of such a name (path in the folder); those of an earlier run that this one
-                has not written are removed from the store.
-            progress: called during the upload.
+                has not written are removed from the store. progress: called during the upload.
 
         Raises:
             OrthoSwarmError: if a file cannot be uploaded; the local files stay, and the next run uploads the rest.
@@ -91,8 +88,7 @@ class PublishedFolder:
 
         Whoever leaves it early, as Ctrl-C does, waits for the files under way only.
 
-        Raises:
-            OrthoSwarmError: when those that were under way have ended, if a file cannot be uploaded.
+        Raises OrthoSwarmError: when those that were under way have ended, if a file cannot be uploaded.
         """
         failed: BaseException | None = None
         with ThreadPoolExecutor(CONNECTIONS) as pool:

@@ -20,14 +20,10 @@ no longer than a second request."""
 
 
 class Parts(Protocol):
-    """A file of which parts are read.
+    """A file of which parts are read."""
 
-    Attributes:
-        size: bytes. is_file: False for a pipe or a device.
-    """
-
-    size: int
-    is_file: bool
+    size: int  # bytes
+    is_file: bool  # False for a pipe or a device
 
     def read(self, offset: int, length: int) -> bytes:
         """Bytes from an offset, fewer at the end."""
@@ -91,8 +87,7 @@ class _StoredParts:
 def open_parts(path: Path) -> Iterator[Parts]:
     """A file for reading parts of it; closed at the end of the context.
 
-    Raises:
-        OSError: if a local file cannot be opened or read. Else see `requests.request`.
+    Raises OSError: if a local file cannot be opened or read. Else see `requests.request`.
     """
     if is_stored(path):
         size = (known(path) or look_up(path)).size

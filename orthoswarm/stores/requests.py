@@ -82,8 +82,7 @@ class StoreAccessError(RunInterruptedError, InputError):
 def file_system(path: Path) -> Any:
     """The file system of fsspec for a path, one for each process.
 
-    Raises:
-        StoreAccessError: if the packages for it are not installed.
+    Raises StoreAccessError: if the packages for it are not installed.
     """
     scheme = path.parts[1].rstrip(":")
     key = (scheme, os.getpid())

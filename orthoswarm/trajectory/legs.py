@@ -1,4 +1,4 @@
-"""Straight runs of a flight, from the path flown (paper III.C groups frames into legs by heading and path)."""
+"""Courses and straight runs of a flight, from the path flown (paper III.C: legs by heading and path)."""
 
 from typing import Final
 
@@ -15,6 +15,8 @@ _LEG_JUMP_STEPS: Final = 6.0  # a step of more than so many median steps and the
 _LEG_JUMP_M: Final = 30.0  # ... metres (receivers' outliers are below)
 _ONE_WAY_DEG: Final = 35.0  # legs within this angle of the longest lead in its direction; not the opposite one
 _OTHER_WAY_SHARE: Final = 0.3  # ways in other directions over the longest leg that tell drift from tilt
+MOVED_M: Final = 1.0  # steps that are shorter have no direction and no spacing: receivers scatter by about that
+_CORNER_DEG: Final = 50.0  # a change of course above this is a corner between two legs and no bend
 
 
 def split_legs(position: Array, time_s: Array | None = None) -> Ints:
@@ -105,3 +107,24 @@ def ended_legs(position: Array, time_s: Array | None = None, *, over: bool = Fal
         if over or last + settled < n:
             ends.append((int(members[0]), last))
     return ends
+
+
+def course(ground: Array) -> Array:
+    """Grid azimuth of flight at each of a vehicle's positions (N, 2), radians; at a corner that of the leg it ends.
+
+    Steps under `MOVED_M` have no direction and take that of the nearest step that has; 0 where nothing moved.
+    """
+    corner_rad = np.radians(_CORNER_DEG)
+    n = len(ground)
+    steps = np.diff(ground, axis=0)
+    moved = np.nonzero(np.hypot(*steps.T) > MOVED_M)[0] if n > 1 else np.empty(0, np.intp)
+    if len(moved) == 0:
+        return np.zeros(n)
+    azimuth = np.arctan2(steps[moved, 0], steps[moved, 1])
+    after = np.searchsorted(moved, np.arange(n))  # the first step that begins here or later
+    into, out = azimuth[np.maximum(after - 1, 0)], azimuth[np.minimum(after, len(moved) - 1)]
+    before = azimuth[np.maximum(after - 2, 0)]
+    corner = np.abs(wrap_rad(out - into)) > corner_rad
+    straight_in = np.abs(wrap_rad(into - before)) < corner_rad
+    middle = into + 0.5 * wrap_rad(out - into)
+    return np.asarray(np.where(corner, np.where(straight_in, into, out), middle))

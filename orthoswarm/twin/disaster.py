@@ -23,28 +23,20 @@ _FALLS_M2: Final = (30.0, 700.0)
 
 @dataclass(frozen=True, slots=True)
 class DamagedGround:
-    """An irregular patch of ground.
+    """An irregular patch of ground."""
 
-    Attributes:
-        east: easting of its centre; north: northing.
-        across_m: its extent at right angles to its axis; along_m: along it.
-        angle_rad: direction of its axis, anticlockwise from east.
-    """
-
-    east: float
-    north: float
-    across_m: float
-    along_m: float
-    angle_rad: float
+    east: float  # easting of its centre
+    north: float  # northing
+    across_m: float  # its extent at right angles to its axis
+    along_m: float  # along it
+    angle_rad: float  # direction of its axis, anticlockwise from east
 
 
 def zone_depth(scene: Scene, zone: DamagedGround, step: int, seed: int) -> Floats:
     """Signed distance of each cell from a zone's ragged edge, metres, positive inside; float32 (rows, columns).
 
     Args:
-        scene: gives the grid.
-        zone: the patch of ground.
-        step: side of a cell of the result, in texels.
+        scene: gives the grid. zone: the patch of ground. step: side of a cell of the result, in texels.
         seed: of the ragged edge.
     """
     rows, cols = scene.grid.height // step, scene.grid.width // step

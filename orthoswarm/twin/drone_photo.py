@@ -17,9 +17,7 @@ from orthoswarm.model.arrays import Bytes, Floats
 class Sensor:
     """A small drone camera with automatic exposure.
 
-    Args:
-        width: columns; height: rows.
-        seed: of the noise array; each picture uses another part of it.
+    width: columns; height: rows. seed: of the noise array; each picture uses another part of it.
     """
 
     def __init__(self, width: int, height: int, seed: int) -> None:
@@ -79,23 +77,15 @@ _XMP: Final = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PhotoTags:
-    """The tags of a photo: time, position, attitude and camera.
+    """The tags of a photo: time, position, attitude and camera."""
 
-    Attributes:
-        time_s: UTC epoch seconds.
-        lat_deg: latitude; lon_deg: longitude, WGS 84.
-        altitude_m: absolute altitude. height_m: over takeoff.
-        gimbal_deg: the camera's yaw (from true north), pitch (-90 straight down), roll.
-        flight_deg: the airframe's yaw, pitch, roll.
-    """
-
-    time_s: float
-    lat_deg: float
-    lon_deg: float
-    altitude_m: float
-    height_m: float
-    gimbal_deg: tuple[float, float, float]
-    flight_deg: tuple[float, float, float]
+    time_s: float  # UTC epoch seconds
+    lat_deg: float  # latitude
+    lon_deg: float  # longitude, WGS 84
+    altitude_m: float  # absolute altitude
+    height_m: float  # over takeoff
+    gimbal_deg: tuple[float, float, float]  # the camera's yaw (from true north), pitch (-90 straight down), roll
+    flight_deg: tuple[float, float, float]  # the airframe's yaw, pitch, roll
 
 
 def with_tags(jpeg: bytes, tags: PhotoTags) -> bytes:

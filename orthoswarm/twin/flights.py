@@ -11,37 +11,24 @@ from orthoswarm.model.camera import Lens, focal_px
 from orthoswarm.model.placement import Terrain
 
 _START_S: Final = 1_750_000_000.0  # UTC epoch seconds of the first vehicle's first picture
-FOVS_DEG = (85.0, 90.0, 95.0, 100.0, 105.0)
-"""The paper's cameras (IV.A)."""
+FOVS_DEG = (85.0, 90.0, 95.0, 100.0, 105.0)  # the paper's cameras (IV.A)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightPlan:
-    """The swarm's flight plan: blocks of parallel legs, one block per vehicle, in rows and columns.
+    """The swarm's flight plan: blocks of parallel legs, one block per vehicle, in rows and columns."""
 
-    Attributes:
-        columns: blocks side by side across the legs; rows: blocks one behind the other along the legs.
-        photos: pictures of each vehicle.
-        legs: legs of each vehicle.
-        spacing_m: distance of pictures along the path.
-        leg_spacing_m: distance of neighbouring legs, also across a border between vehicles.
-        height_m: flying height over takeoff.
-        speed_m_s: cruising speed.
-        heading_rad: grid azimuth of the first leg.
-        width: columns of a picture; height: rows.
-    """
-
-    columns: int = 3
-    rows: int = 1
-    photos: int = 339
-    legs: int = 4
-    spacing_m: float = 8.75
-    leg_spacing_m: float = 100.0
-    height_m: float = 150.0
-    speed_m_s: float = 8.75
-    heading_rad: float = 0.0
-    width: int = 640
-    height: int = 480
+    columns: int = 3  # blocks side by side across the legs
+    rows: int = 1  # blocks one behind the other along the legs
+    photos: int = 339  # pictures of each vehicle
+    legs: int = 4  # legs of each vehicle
+    spacing_m: float = 8.75  # distance of pictures along the path
+    leg_spacing_m: float = 100.0  # distance of neighbouring legs, also across a border between vehicles
+    height_m: float = 150.0  # flying height over takeoff
+    speed_m_s: float = 8.75  # cruising speed
+    heading_rad: float = 0.0  # grid azimuth of the first leg
+    width: int = 640  # columns of a picture
+    height: int = 480  # rows
 
     @property
     def leg_length_m(self) -> float:
@@ -91,29 +78,17 @@ class FlightPlan:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrueFlight:
-    """The true flight of one vehicle.
-
-    Attributes:
-        vehicle: its id.
-        lens: its camera's true lens.
-        mount_rad: fixed offsets of the camera from the airframe (yaw, pitch).
-        time_s: float64 (N,), UTC epoch seconds of the pictures.
-        planned: float64 (N, 3), planned position of each picture.
-        position: float64 (N, 3), true position of the camera.
-        velocity: float64 (N, 2), true ground speed.
-        angles: float64 (N, 3), the camera's true GRID yaw, pitch, roll in radians.
-        body: float64 (N, 3), the airframe's GRID yaw, pitch, roll in radians.
-    """
+    """The true flight of one vehicle."""
 
     vehicle: str
-    lens: Lens
-    mount_rad: tuple[float, float]
-    time_s: Array
-    planned: Array
-    position: Array
-    velocity: Array
-    angles: Array
-    body: Array
+    lens: Lens  # its camera's true lens
+    mount_rad: tuple[float, float]  # fixed offsets of the camera from the airframe (yaw, pitch)
+    time_s: Array  # float64 (N,), UTC epoch seconds of the pictures
+    planned: Array  # float64 (N, 3), planned position of each picture
+    position: Array  # float64 (N, 3), true position of the camera
+    velocity: Array  # float64 (N, 2), true ground speed
+    angles: Array  # float64 (N, 3), the camera's true GRID yaw, pitch, roll in radians
+    body: Array  # float64 (N, 3), the airframe's GRID yaw, pitch, roll in radians
 
 
 def smooth_noise(rng: np.random.Generator, n: int, length: float, sigma: float) -> Array:
@@ -180,29 +155,18 @@ def _slew(heading: Array, seconds: Array, rate_rad_s: float) -> Array:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightDeviations:
-    """Deviations of the true flight from the plan.
+    """Deviations of the true flight from the plan."""
 
-    Attributes:
-        track_m: one sigma of the horizontal deviation from the plan, slowly varying.
-        attitude_deg: one sigma of roll and pitch of the airframe, slowly varying; jitter_deg: from picture to picture.
-        height_m: one sigma of the height.
-        drift_m: drift of the receiver, which the autopilot follows, so that the true path leaves the plan.
-        mount_yaw_deg: range of the camera's fixed yaw offset; mount_pitch_deg: of its pitch offset.
-        wind_m_s: wind, from a direction drawn for the set; the nose turns into it by the crab angle.
-        air_speed_m_s: speed through the air, used in wind only.
-        curve_radius_m: legs are arcs of this radius, to the left and right in turn; 0: straight.
-    """
-
-    track_m: float = 0.4
-    attitude_deg: float = 1.2
-    jitter_deg: float = 0.25
-    height_m: float = 0.35
-    drift_m: float = 0.0
-    mount_yaw_deg: float = 30.0
-    mount_pitch_deg: float = 5.0
-    wind_m_s: float = 0.0
-    air_speed_m_s: float = 15.0
-    curve_radius_m: float = 0.0
+    track_m: float = 0.4  # one sigma of the horizontal deviation from the plan, slowly varying
+    attitude_deg: float = 1.2  # one sigma of roll and pitch of the airframe, slowly varying
+    jitter_deg: float = 0.25  # from picture to picture
+    height_m: float = 0.35  # one sigma of the height
+    drift_m: float = 0.0  # drift of the receiver, which the autopilot follows, so that the true path leaves the plan
+    mount_yaw_deg: float = 30.0  # range of the camera's fixed yaw offset
+    mount_pitch_deg: float = 5.0  # of its pitch offset
+    wind_m_s: float = 0.0  # wind, from a direction drawn for the set; the nose turns into it by the crab angle
+    air_speed_m_s: float = 15.0  # speed through the air, used in wind only
+    curve_radius_m: float = 0.0  # legs are arcs of this radius, to the left and right in turn; 0: straight
 
 
 def fly(
@@ -217,12 +181,9 @@ def fly(
     """One vehicle's true flight.
 
     Args:
-        plan: the swarm's flight plan.
-        motion: deviations from it, the wind and the curvature of legs.
-        center: grid coordinates of the area's centre.
-        vehicle: its number.
-        seed: of the set; each vehicle draws its own numbers from it.
-        lens_k: radial distortion k1, k2 of all lenses.
+        plan: the swarm's flight plan. motion: deviations from it, the wind and the curvature of legs.
+        center: grid coordinates of the area's centre. vehicle: its number.
+        seed: of the set; each vehicle draws its own numbers from it. lens_k: radial distortion k1, k2 of all lenses.
     """
     rng = np.random.default_rng([seed, 41, vehicle])
     n = plan.photos
@@ -285,45 +246,29 @@ def _receiver_drift(rng: np.random.Generator, n: int, size: float) -> Array:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Noise:
-    """Errors of recorded poses; each value is one sigma or a half range, as stated.
+    """Errors of recorded poses; each value is one sigma or a half range, as stated."""
 
-    Attributes:
-        position_m: half range of the uniform error of each picture's horizontal position (paper IV.A: 1 m).
-        drift_per_photo_m: half range of the drift per picture; the drift is index times one draw per vehicle
-            and axis (paper IV.A: 0.1 m).
-        heading_bias_deg: one sigma of a vehicle's fixed compass error. tilt_bias_deg: of its pitch and roll error.
-        angle_deg: one sigma of the angles from picture to picture.
-        outlier_share: share of positions that are 5 to 20 m off.
-        lag_s: (smallest, largest) delay of positions in seconds, one draw per vehicle.
-        height_m: one sigma of the height from picture to picture. height_offset_m: fixed offset of all heights.
-        follows_plan: the autopilot steers by the drifting receiver, so the recorded positions follow the plan.
-    """
-
-    position_m: float = 1.0
+    position_m: float = 1.0  # half range of the uniform error of each picture's horizontal position (paper IV.A: 1 m)
+    # half range of the drift per picture; the drift is index times one draw per vehicle and axis (paper IV.A: 0.1 m)
     drift_per_photo_m: float = 0.1
-    heading_bias_deg: float = 0.0
-    tilt_bias_deg: float = 0.0
-    angle_deg: float = 0.0
-    outlier_share: float = 0.0
-    lag_s: tuple[float, float] = (0.0, 0.0)
-    height_m: float = 0.0
-    height_offset_m: float = 0.0
+    heading_bias_deg: float = 0.0  # one sigma of a vehicle's fixed compass error
+    tilt_bias_deg: float = 0.0  # of its pitch and roll error
+    angle_deg: float = 0.0  # one sigma of the angles from picture to picture
+    outlier_share: float = 0.0  # share of positions that are 5 to 20 m off
+    lag_s: tuple[float, float] = (0.0, 0.0)  # (smallest, largest) delay of positions in seconds, one draw per vehicle
+    height_m: float = 0.0  # one sigma of the height from picture to picture
+    height_offset_m: float = 0.0  # fixed offset of all heights
+    # the autopilot steers by the drifting receiver, so the recorded positions follow the plan
     follows_plan: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """Recorded poses of one vehicle.
+    """Recorded poses of one vehicle."""
 
-    Attributes:
-        position: float64 (N, 3), easting, northing, height over takeoff.
-        angles: float64 (N, 3), the camera's GRID yaw, pitch, roll in radians.
-        body: float64 (N, 3), the airframe's.
-    """
-
-    position: Array
-    angles: Array
-    body: Array
+    position: Array  # float64 (N, 3), easting, northing, height over takeoff
+    angles: Array  # float64 (N, 3), the camera's GRID yaw, pitch, roll in radians
+    body: Array  # float64 (N, 3), the airframe's
 
 
 def record(flight: TrueFlight, noise: Noise, vehicle: int, seed: int) -> Record:

@@ -1,7 +1,6 @@
 """Make a data set: the map before the disaster, the photos after it, and the truth in its own folder."""
 
 import json
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,7 +10,6 @@ import numpy as np
 from orthoswarm.model.arrays import Array, Floats
 from orthoswarm.model.camera import Camera, rotation_from_angles
 from orthoswarm.model.errors import InputError
-from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.task_runner import Progress
 from orthoswarm.twin.dataset_files import (
     after_disaster,
@@ -39,18 +37,12 @@ A half-made set is continued only by the version that began it.
 
 @dataclass(frozen=True, slots=True)
 class TwinSet:
-    """Summary of a data set after `make_twin`.
+    """Summary of a data set after `make_twin`."""
 
-    Attributes:
-        folder: of the set.
-        photos: pictures of the set; made: those rendered in this run (the others existed).
-        vehicles: number of vehicles.
-    """
-
-    folder: Path
-    photos: int
-    made: int
-    vehicles: int
+    folder: Path  # of the set
+    photos: int  # pictures of the set
+    made: int  # those rendered in this run (the others existed)
+    vehicles: int  # number of vehicles
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,20 +64,38 @@ def make_twin(
     dtm.tif, masks and manifest.json. The same spec gives the same bytes.
 
     Args:
-        spec: what to make.
-        folder: where to put it.
-        workers: threads that render.
+        spec: what to make. folder: where to put it. workers: threads that render.
         progress: called with a stage's name, the number of finished items and their total.
         only: stop after this many new pictures (None: all).
 
     Raises:
         InputError: if the folder holds another set.
     """
+    import cv2
+
     report = progress or (lambda *_: None)
     made = make_scene(spec, folder, report)
+    shots = []  # of the pictures that do not exist yet: path, vehicle and index
+    for v, flight in enumerate(made.flights):
+        (folder / "photos" / flight.vehicle).mkdir(parents=True, exist_ok=True)
+        for i in range(0, len(flight.time_s), spec.every):
+            path = folder / "photos" / photo_name(flight.vehicle, i)
+            if not path.exists():
+                shots.append((path, v, i))
+    shots = shots[:only]
+    cv2.setNumThreads(1)
+    rays = {v: lens_rays(made.flights[v].lens, spec.rays) for v in {v for _, v, _ in shots}}
+    sensor = Sensor(spec.plan.width, spec.plan.height, spec.seed)
+    report("photos", 0, len(shots))
+
+    def one(shot: tuple[Path, int, int]) -> None:
+        path, v, i = shot
+        write_atomic(path, _photo(spec, made, v, i, rays=rays[v], sensor=sensor))
+
+    with ThreadPoolExecutor(workers) as pool:
+        for done, _ in enumerate(pool.map(one, shots), start=1):
+            report("photos", done, len(shots))
     total = spec.plan.vehicles * len(range(0, spec.plan.photos, spec.every))
-    shots = list(_missing(spec, made.flights, made.records, folder))[:only]
-    _render_all(spec, made.stage, made.site.grid, shots=shots, workers=workers, report=report)
     return TwinSet(folder, total, len(shots), spec.plan.vehicles)
 
 
@@ -125,58 +135,18 @@ def _claim(manifest: Path, spec: TwinSpec) -> None:
     write_atomic(manifest, text.encode())
 
 
-@dataclass(frozen=True, slots=True)
-class _TwinShot:
-    path: Path
-    flight: TrueFlight
-    record: Record
-    vehicle: int
-    index: int
-
-
-def _missing(spec: TwinSpec, flights: list[TrueFlight], records: list[Record], folder: Path) -> Iterator[_TwinShot]:
-    """The pictures that do not exist yet."""
-    for v, (flight, recorded) in enumerate(zip(flights, records, strict=True)):
-        (folder / "photos" / flight.vehicle).mkdir(parents=True, exist_ok=True)
-        for i in range(0, len(flight.time_s), spec.every):
-            path = folder / "photos" / photo_name(flight.vehicle, i)
-            if not path.exists():
-                yield _TwinShot(path, flight, recorded, v, i)
-
-
-def _render_all(
-    spec: TwinSpec, stage: PreparedScene, grid: LocalGrid, *, shots: list[_TwinShot], workers: int, report: Progress
-) -> None:
-    """Render and write all shots."""
-    import cv2
-
-    cv2.setNumThreads(1)
-    rays = {shot.vehicle: lens_rays(shot.flight.lens, spec.rays) for shot in {s.vehicle: s for s in shots}.values()}
-    sensor = Sensor(spec.plan.width, spec.plan.height, spec.seed)
-    report("photos", 0, len(shots))
-
-    def one(shot: _TwinShot) -> None:
-        write_atomic(shot.path, _photo(spec, stage, grid, shot=shot, rays=rays[shot.vehicle], sensor=sensor))
-
-    with ThreadPoolExecutor(workers) as pool:
-        for done, _ in enumerate(pool.map(one, shots), start=1):
-            report("photos", done, len(shots))
-
-
-def _photo(
-    spec: TwinSpec, stage: PreparedScene, grid: LocalGrid, *, shot: _TwinShot, rays: Floats, sensor: Sensor
-) -> bytes:
-    """One JPEG with its tags."""
-    flight, i = shot.flight, shot.index
+def _photo(spec: TwinSpec, made: TwinScene, vehicle: int, i: int, *, rays: Floats, sensor: Sensor) -> bytes:
+    """The JPEG of a vehicle's i-th picture with its tags."""
+    flight, recorded = made.flights[vehicle], made.records[vehicle]
     camera = Camera(flight.position[i], rotation_from_angles(*flight.angles[i]), flight.lens)
-    rng = np.random.default_rng([spec.seed, 83, shot.vehicle, i])
+    rng = np.random.default_rng([spec.seed, 83, vehicle, i])
     wind = np.array([0.0, 0.0, 0.0, 0.0, 1.1, 0.4, 0.5, -0.3]) * flight.time_s[i]
     jump = np.array([1e3, 1e3, 1e3, 1e3, 25.0, 25.0, 8.0, 8.0])
     motion = (wind + rng.uniform(0, 1, 8) * jump) % 1024.0
-    image = sensor.expose(render(stage, camera, rays, motion), rng)
-    position, angles, body = shot.record.position[i], shot.record.angles[i], shot.record.body[i]
-    lat, lon = (float(x) for x in grid.to_geographic(position[:2]))
-    convergence = float(grid.convergence_rad(lat, lon))
+    image = sensor.expose(render(made.stage, camera, rays, motion), rng)
+    position, angles, body = recorded.position[i], recorded.angles[i], recorded.body[i]
+    lat, lon = (float(x) for x in made.site.grid.to_geographic(position[:2]))
+    convergence = float(made.site.grid.convergence_rad(lat, lon))
     tags = PhotoTags(
         time_s=float(flight.time_s[i]), lat_deg=lat, lon_deg=lon, altitude_m=float(position[2]) + SEA_LEVEL_M,
         height_m=float(position[2]), gimbal_deg=_degrees(angles, convergence), flight_deg=_degrees(body, convergence),

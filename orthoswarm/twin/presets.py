@@ -29,50 +29,31 @@ _MOTIONS: dict[str, dict[str, float]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TwinSpec:
-    """All parameters of a data set; equal parameters give equal files.
+    """All parameters of a data set; equal parameters give equal files."""
 
-    Attributes:
-        preset: name of the preset that it is based on.
-        seed: of all random numbers.
-        disaster: none, debris, water, haze, all three of them, or collapse (of houses).
-        noise_name: kind of noise; noise: its values.
-        plan: the flight. motion: how calmly it is flown.
-        relief_m: ground relief, +- metres (procedural city only).
-        follow_ground: legs keep their height above the bare ground; else they are level.
-        lens_k: true radial distortion k1, k2 of all lenses.
-        lean: relief displacement in the map, metres per metre of height; lean_deg: its azimuth; None: random.
-        map_gsd_m: pixel of the basemap. reference_gsd_m: of the reference.
-        lat_deg: where the procedural city lies; lon_deg.
-        quality: of the JPEGs.
-        rays: rays along the side of a pixel; 2 gives smooth edges, 1 is four times faster.
-        every: render only every n-th picture of each vehicle (records and truth stay those of the full flight).
-        ground: orthoimage and surface model of a real place instead of the city, None for the city.
-        margin_m: ground beyond the outermost legs.
-        cars: share of the parking places with a car.
-    """
-
-    preset: str = "debris"
-    seed: int = 1
-    disaster: str = "debris"
-    noise_name: str = "paper"
-    noise: Noise = field(default_factory=Noise)
-    plan: FlightPlan = field(default_factory=FlightPlan)
-    motion: FlightDeviations = field(default_factory=FlightDeviations)
-    relief_m: float = 0.0
-    follow_ground: bool = False
-    lens_k: tuple[float, float] = (0.0, 0.0)
-    lean: float | None = None
-    lean_deg: float | None = None
-    map_gsd_m: float = 0.4
-    reference_gsd_m: float = 0.3
-    lat_deg: float = 30.57
+    preset: str = "debris"  # name of the preset that it is based on
+    seed: int = 1  # of all random numbers
+    disaster: str = "debris"  # none, debris, water, haze, all three of them, or collapse (of houses)
+    noise_name: str = "paper"  # kind of noise
+    noise: Noise = field(default_factory=Noise)  # its values
+    plan: FlightPlan = field(default_factory=FlightPlan)  # the flight
+    motion: FlightDeviations = field(default_factory=FlightDeviations)  # how calmly it is flown
+    relief_m: float = 0.0  # ground relief, +- metres (procedural city only)
+    follow_ground: bool = False  # legs keep their height above the bare ground; else they are level
+    lens_k: tuple[float, float] = (0.0, 0.0)  # true radial distortion k1, k2 of all lenses
+    lean: float | None = None  # relief displacement in the map, metres per metre of height
+    lean_deg: float | None = None  # its azimuth; None: random
+    map_gsd_m: float = 0.4  # pixel of the basemap
+    reference_gsd_m: float = 0.3  # of the reference
+    lat_deg: float = 30.57  # where the procedural city lies; lon_deg
     lon_deg: float = 103.2
-    quality: int = 92
-    rays: int = 2
-    every: int = 1
+    quality: int = 92  # of the JPEGs
+    rays: int = 2  # rays along the side of a pixel; 2 gives smooth edges, 1 is four times faster
+    every: int = 1  # render only every n-th picture of each vehicle (records and truth stay those of the full flight)
+    # orthoimage and surface model of a real place instead of the city, None for the city
     ground: tuple[str, str, str] | None = None
-    margin_m: float = 290.0
-    cars: float = 0.5
+    margin_m: float = 290.0  # ground beyond the outermost legs
+    cars: float = 0.5  # share of the parking places with a car
 
 
 _TINY = FlightPlan(
@@ -95,8 +76,7 @@ PRESETS: dict[str, TwinSpec] = {
 def spec(preset: str, *, seed: int = 1, noise: str = "paper", **changes: Any) -> TwinSpec:
     """A preset with a seed, a kind of noise, and further fields of TwinSpec replaced.
 
-    Raises:
-        InputError: for a preset or a kind of noise that does not exist.
+    Raises InputError: for a preset or a kind of noise that does not exist.
     """
     if preset not in PRESETS:
         raise InputError(f"there is no preset '{preset}'; choose one of: {', '.join(PRESETS)}")

@@ -23,24 +23,15 @@ BLOCK = 16
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PreparedScene:
-    """A scene prepared for rendering.
+    """A scene prepared for rendering."""
 
-    Attributes:
-        scene: heights and kinds.
-        levels: lit colours at 0.25, 0.5 and 1 m, uint8 (rows, columns, 3) each.
-        tiles: float32, highest point of each tile, plus 0.3 m for tilted tops.
-        sun: unit vector to the sun (columns, rows, up), for walls; ambient: light in the shade.
-        haze: float32 on 4 m cells, opacity of the haze, 0 to 1; shape (0, 0) without haze.
-        noise: float32 (1024, 1024), read with wrap-around, for moving glints and haze.
-    """
-
-    scene: Scene
-    levels: tuple[Bytes, Bytes, Bytes]
-    tiles: Floats
-    sun: tuple[float, float, float]
-    ambient: float
-    haze: Floats
-    noise: Floats
+    scene: Scene  # heights and kinds
+    levels: tuple[Bytes, Bytes, Bytes]  # lit colours at 0.25, 0.5 and 1 m, uint8 (rows, columns, 3) each
+    tiles: Floats  # float32, highest point of each tile, plus 0.3 m for tilted tops
+    sun: tuple[float, float, float]  # unit vector to the sun (columns, rows, up), for walls
+    ambient: float  # light in the shade
+    haze: Floats  # float32 on 4 m cells, opacity of the haze, 0 to 1; shape (0, 0) without haze
+    noise: Floats  # float32 (1024, 1024), read with wrap-around, for moving glints and haze
 
 
 def make_stage(
@@ -319,10 +310,8 @@ def render(stage: PreparedScene, camera: Camera, rays: Floats, motion: Array) ->
     """One picture, float32 (rows, columns, 3), red first, before the sensor.
 
     Args:
-        stage: the scene with its light.
-        camera: in the scene's grid; heights over takeoff.
-        rays: from `lens_rays` of the camera's lens.
-        motion: float64 (8,), offsets of waves and haze at this moment.
+        stage: the scene with its light. camera: in the scene's grid; heights over takeoff.
+        rays: from `lens_rays` of the camera's lens. motion: float64 (8,), offsets of waves and haze at this moment.
     """
     s = stage.scene
     out = np.empty((camera.lens.height, camera.lens.width, 3), np.float32)
@@ -365,15 +354,9 @@ def _satellite(texture, dsm, dtm, tiles, wall, facade, sun, ambient, ca, sa, lea
                     wide, high = CELL_M * dsm.shape[1], CELL_M * dsm.shape[0]
                     rise = min(_rise_inside(x, lean_x, wide), _rise_inside(y, lean_y, high))
                     hr, hc, z, side = _march(
-                        dsm,
-                        tiles,
-                        x / CELL_M,
-                        y / CELL_M,
-                        float(ground),
-                        lean_x / CELL_M,
-                        lean_y / CELL_M,
+                        dsm, tiles, x / CELL_M, y / CELL_M, float(ground), lean_x / CELL_M, lean_y / CELL_M,
                         ground + rise,
-                    )
+                    )  # fmt: skip
                 if hr < 0:
                     rgb[0] = rgb[1] = rgb[2] = 0.0
                 elif side > 0 and dsm[hr, hc] - z > 0.45:

@@ -49,8 +49,7 @@ class Site:
 def disaster_zones(spec: TwinSpec, site: Site) -> dict[str, DamagedGround]:
     """Disaster zones by name: one near the middle of the area, or with `all` one in each third of it.
 
-    Raises:
-        InputError: for a disaster that does not exist.
+    Raises InputError: for a disaster that does not exist.
     """
     if spec.disaster == "none":
         return {}

@@ -1,14 +1,15 @@
 """Lists the inputs: pictures by folder, videos, pose tables, logs; names relative to the inputs' root."""
 
+import contextlib
 import hashlib
 import os
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 from orthoswarm.model.errors import InputError
 from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
@@ -44,23 +45,18 @@ _COPIED_LEAST: Final = 3  # two folders with so many photos in common may be one
 
 @dataclass(slots=True, kw_only=True)
 class Folder:
-    """One folder that contains usable files.
+    """One folder that contains usable files."""
 
-    Attributes:
-        path: of the folder. vehicle: id of the vehicle whose photos it contains.
-        pictures: files with a picture's suffix; videos; logs; subtitles (SRT); tables (text and CSV), in natural order.
-        sidecars: XMP beside pictures. unread: other files that may say something about pictures.
-    """
-
-    path: Path
-    vehicle: str
+    path: Path  # of the folder
+    vehicle: str  # id of the vehicle whose photos it contains
+    # files with a picture's suffix; videos; logs; subtitles (SRT); tables (text and CSV), in natural order
     pictures: list[Path] = field(default_factory=list)
     videos: list[Path] = field(default_factory=list)
     logs: list[Path] = field(default_factory=list)
     subtitles: list[Path] = field(default_factory=list)
     tables: list[Path] = field(default_factory=list)
-    sidecars: dict[Path, Path] = field(default_factory=dict)
-    unread: list[Path] = field(default_factory=list)
+    sidecars: dict[Path, Path] = field(default_factory=dict)  # XMP beside pictures
+    unread: list[Path] = field(default_factory=list)  # other files that may say something about pictures
 
     def take_sidecars(self) -> None:
         """Match XMP files with the pictures that they are named like: `DJI_0001.xmp` or `DJI_0001.JPG.xmp`."""
@@ -76,24 +72,19 @@ class Folder:
 
 @dataclass(frozen=True, slots=True)
 class Discovery:
-    """All folders of the inputs, and the root of picture names.
+    """All folders of the inputs, and the root of picture names."""
 
-    Attributes:
-        root: names are relative to it. folders: those with usable files.
-        left_out: files with a picture's suffix that are not read, the reason (one for all that share it) and a detail.
-        videos: the vehicle of each video, unless its metadata names another.
-        unreadable: folders that cannot be listed -> the system's reason.
-        copies: photos that are the same files as photos in another folder, with these.
-        everywhere: tables and logs given by themselves or in folders without pictures and videos.
-    """
-
-    root: Path
-    folders: list[Folder]
+    root: Path  # names are relative to it
+    folders: list[Folder]  # those with usable files
+    # files with a picture's suffix that are not read, the reason (one for all that share it) and a detail
     left_out: list[tuple[Path, str, str]] = field(default_factory=list)
+    # the vehicle of each video, unless its metadata names another
     videos: dict[Path, str] = field(default_factory=dict)
+    # tables and logs given by themselves or in folders without pictures and videos
     everywhere: frozenset[Path] = frozenset()
     _: KW_ONLY
-    unreadable: dict[Path, str] = field(default_factory=dict)
+    unreadable: dict[Path, str] = field(default_factory=dict)  # folders that cannot be listed -> the system's reason
+    # photos that are the same files as photos in another folder, with these
     copies: dict[Path, Path] = field(default_factory=dict)
 
     def scope(self, path: Path) -> Path:
@@ -130,8 +121,7 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
     A video or photo given by itself includes the files next to it that describe its pose: the SRT of the same name,
     geo.txt and CSV. Logs must be given, as those of other flights may be there.
 
-    Raises:
-        InputError: no input, or one that does not exist or is a folder that cannot be listed.
+    Raises InputError: no input, or one that does not exist or is a folder that cannot be listed.
     """
     if not inputs:
         raise InputError("no input was given; name a folder of photos or a video")
@@ -172,20 +162,19 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
         folder.take_sidecars()
         folder.pictures.sort(key=lambda path: natural_key(path.name))
     ordered = [folders[path] for path in sorted(folders, key=lambda p: natural_key(str(p)))]
-    copies = copies_among([path for folder in ordered for path in folder.pictures])
-    for folder in ordered if copies.within else ():
-        folder.pictures = [path for path in folder.pictures if path not in copies.within]
+    within, elsewhere = copies_among([path for folder in ordered for path in folder.pictures])
+    for folder in ordered if within else ():
+        folder.pictures = [path for path in folder.pictures if path not in within]
     _name_vehicles(ordered, root)
     pictures = [(file, *why) for file, why in left_out.items() if file.suffix.lower() in PICTURE_SUFFIXES]
     left = [entry for entry in pictures if entry[0] not in sorted_in]
-    left += [(copy, _COPY, first.name) for copy, first in copies.within.items()]
+    left += [(copy, _COPY, first.name) for copy, first in within.items()]
     if unreadable and not ordered and not left:
         path, why = next(iter(unreadable.items()))
         raise InputError(f"no picture was found, and the folder {path} cannot be read ({why}); check its permissions")
     apart = _far_from_pictures(tops, ordered)
-    return Discovery(
-        root, ordered, left, _video_vehicles(ordered, root), apart, unreadable=unreadable, copies=copies.elsewhere
-    )
+    vehicles = _video_vehicles(ordered, root)
+    return Discovery(root, ordered, left, vehicles, apart, unreadable=unreadable, copies=elsewhere)
 
 
 def _twice(folder: Path, root: Path) -> str:
@@ -300,14 +289,7 @@ def _video_vehicles(folders: list[Folder], root: Path) -> dict[Path, str]:
     }
 
 
-class Copies(NamedTuple):
-    """Photos that are the same files as others, with these: in their own folder, and in an earlier one."""
-
-    within: dict[Path, Path]
-    elsewhere: dict[Path, Path]
-
-
-def copies_among(photos: Sequence[Path]) -> Copies:
+def copies_among(photos: Sequence[Path]) -> tuple[dict[Path, Path], dict[Path, Path]]:
     """Copies among the photos of all folders: in one folder, "DJI_0001 (1).JPG", or in a second one, under any names.
 
     Those in a second folder, a backup beside the original perhaps, are told and not left out: a folder is a vehicle,
@@ -318,10 +300,17 @@ def copies_among(photos: Sequence[Path]) -> Copies:
     Folders that have only one or two photos in common count as two. Only files that share their size with another are
     opened, and only those that begin like another are read beyond: raw pictures are all of one size, and each sample
     is a seek on a disk. Files in stores are not compared.
+
+    Returns photos that are the same files as others, with these: in their own folder, and in an earlier one.
     """
+    by_size: dict[int, list[Path]] = {}
+    for path in photos:
+        if not is_stored(path):
+            with contextlib.suppress(OSError):  # reading it says what is wrong
+                by_size.setdefault(os.stat(path).st_size, []).append(path)
     within: dict[Path, Path] = {}
     elsewhere: dict[Path, Path] = {}
-    for of_one_size in _of_one_size(photos):
+    for of_one_size in (alike for size, alike in by_size.items() if size and len(alike) > 1):
         for of_one_beginning in _alike(of_one_size, 0):
             for alike in _alike(of_one_beginning, _SAMPLES):
                 within |= _within(alike)
@@ -331,7 +320,7 @@ def copies_among(photos: Sequence[Path]) -> Copies:
     for copy, first in elsewhere.items():
         in_common.setdefault((copy.parent, first.parent), set()).add(first)
     many = {folders for folders, photos in in_common.items() if len(photos) >= _COPIED_LEAST}
-    return Copies(within, {c: first for c, first in elsewhere.items() if (c.parent, first.parent) in many})
+    return within, {c: first for c, first in elsewhere.items() if (c.parent, first.parent) in many}
 
 
 def _within(alike: Sequence[Path]) -> dict[Path, Path]:
@@ -351,17 +340,6 @@ def _within(alike: Sequence[Path]) -> dict[Path, Path]:
             if another or (named and _COPY_NAME.fullmatch(before + after)):
                 found[path] = first
     return found
-
-
-def _of_one_size(photos: Sequence[Path]) -> Iterator[list[Path]]:
-    by_size: dict[int, list[Path]] = {}
-    for path in photos:
-        if not is_stored(path):
-            try:
-                by_size.setdefault(os.stat(path).st_size, []).append(path)
-            except OSError:  # reading it says what is wrong
-                continue
-    return (alike for size, alike in by_size.items() if size and len(alike) > 1)
 
 
 def _alike(photos: Sequence[Path], samples: int) -> list[list[Path]]:

@@ -23,9 +23,15 @@ from telemetry.formats.video.sei import read_sei_layout, register
 from telemetry.ingest.discovery import Discovery, Folder, discover, natural_key
 from telemetry.ingest.log_choice import LogSource
 from telemetry.ingest.log_ingest import add_logs, read_logs
-from telemetry.ingest.picture_kinds import Reasons, of_other_kinds, of_other_sources, of_second_cameras
-from telemetry.ingest.side_files import read_control_points
-from telemetry.ingest.strangers import copies_in_other_folders, strangers
+from telemetry.ingest.strangers import (
+    Reasons,
+    copies_in_other_folders,
+    of_other_kinds,
+    of_other_sources,
+    of_second_cameras,
+    strangers,
+)
+from telemetry.ingest.summary import read_control_points
 from telemetry.ingest.survey import LoadOptions, SourceInfo, Survey
 from telemetry.ingest.track_poses import SHIFTED, clock_went_back, in_order
 from telemetry.ingest.video_ingest import read_videos
@@ -53,20 +59,17 @@ _ROUNDED: Final = 12.0**-0.5  # sigma of what was rounded, in its steps
 def load(inputs: Sequence[Path], *, progress: Progress | None = None, options: LoadOptions | None = None) -> Ingest:
     """Read inputs into frames: folders of photos (recursive; each folder with photos is one vehicle), photos, videos.
 
-    Raises:
-        InputError: an input does not exist or is of no known kind, or a SEI layout is wrong.
+    Raises InputError: an input does not exist or is of no known kind, or a SEI layout is wrong.
     """
     found = survey(inputs, progress=progress, options=options)
     told = [str(finding) for finding in found.findings if not finding.note]
-    told += [_told(finding, source) for source in found.sources for finding in source.findings if not finding.note]
-    warnings = dict.fromkeys(told)
-    return Ingest(found.frames(), found.rejected, list(warnings), found.unpositioned)
-
-
-def _told(finding: Finding, source: SourceInfo) -> str:
-    """A finding as a sentence that says what it is about, also where its source is not named above it."""
-    named = finding.vehicle or source.path.rsplit("/", 1)[-1] in finding.message
-    return str(finding) if named else f"{source.path}: {finding}"
+    for source in found.sources:
+        title = source.path.rsplit("/", 1)[-1]
+        for finding in source.findings:
+            if not finding.note:  # each says what it is about, also where its source is not named above it
+                named = finding.vehicle or title in finding.message
+                told.append(str(finding) if named else f"{source.path}: {finding}")
+    return Ingest(found.frames(), found.rejected, list(dict.fromkeys(told)), found.unpositioned)
 
 
 def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options: LoadOptions | None = None) -> Survey:

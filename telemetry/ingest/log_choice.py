@@ -44,21 +44,15 @@ class LogSource:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogMatch:
-    """A log that fits some pictures.
+    """A log that fits some pictures."""
 
-    Attributes:
-        entry: the log. offset_s: the pictures' clock minus UTC. how: what it fits by, for messages.
-        rank: 0 for the strongest evidence. misfit: in it, smaller is better; differences up to `margin` decide nothing.
-        by_positions: whether the misfit is a distance, metres.
-    """
-
-    entry: LogSource
-    offset_s: float
-    how: str
-    rank: int
-    misfit: float = 0.0
+    entry: LogSource  # the log
+    offset_s: float  # the pictures' clock minus UTC
+    how: str  # what it fits by, for messages
+    rank: int  # 0 for the strongest evidence
+    misfit: float = 0.0  # in it, smaller is better; differences up to `margin` decide nothing
     margin: float = 0.0
-    by_positions: bool = False
+    by_positions: bool = False  # whether the misfit is a distance, metres
 
 
 def best_log(matches: Sequence[LogMatch], what: str, is_named: Callable[[FlightLog], bool]) -> LogMatch | Finding:
@@ -67,8 +61,7 @@ def best_log(matches: Sequence[LogMatch], what: str, is_named: Callable[[FlightL
     Where logs of several vehicles fit equally well, only one that is named like the pictures (`is_named`) is taken: the
     vehicles of a swarm fly at the same time, so that a guess would put pictures elsewhere without a sign of it.
 
-    Args:
-        matches: at least one. what: the pictures, for messages ("a.mp4").
+    matches: at least one. what: the pictures, for messages ("a.mp4").
     """
     best = min(matches, key=lambda match: (match.rank, match.misfit))
     rivals = [m for m in matches if m.rank == best.rank and m.misfit <= best.misfit + best.margin]

@@ -159,7 +159,8 @@ def add_logs(
         workers: threads that read photos if their times do not decide which camera event they belong to.
     """
     near = [entry for entry in logs if folder.is_relative_to(entry.folder)]
-    if not near or not photos or all(_is_complete(photo) for photo in photos):
+    complete = (p.lat_deg is not None and p.height_m is not None and p.camera_deg[0] is not None for p in photos)
+    if not near or not photos or all(complete):
         return
     pairings: dict[int, Pairing] = {}
     matches = []
@@ -208,17 +209,6 @@ def _event_span(log: FlightLog, offset_s: float) -> tuple[float, float]:
     return min(moments) + offset_s, max(moments) + offset_s
 
 
-def _use_log(
-    photos: Sequence[Photo], entry: LogSource, pairing: Pairing, vehicle: str, findings: list[Finding], *,
-    workers: int,
-) -> None:  # fmt: skip
-    """Assign photos the poses of a log's events; pictures are read where the times do not decide."""
-    if pairing.doubtful and not pairing.jumps:
-        motion = picture_motion(photos, entry.log, entry.timeline, workers)
-        pairing = _pair(photos, entry.log.events, motion) if motion is not None else pairing
-    _use_events(photos, pairing, entry, vehicle, findings)
-
-
 def _misfit(photos: Sequence[Photo], pairing: Pairing, entry: LogSource) -> float:
     """How badly a log fits photos: 0 if each has its event where it lies; leftovers, residuals and repeated use add."""
     events = entry.log.events
@@ -231,10 +221,6 @@ def _misfit(photos: Sequence[Photo], pairing: Pairing, entry: LogSource) -> floa
     return 1.0 - share + clock + other_day + 0.6 * entry.used + away
 
 
-def _is_complete(photo: Photo) -> bool:
-    return photo.lat_deg is not None and photo.height_m is not None and photo.camera_deg[0] is not None
-
-
 def _pair(photos: Sequence[Photo], events: Sequence[ExposureEvent], motion: PictureMotion | None = None) -> Pairing:
     return pair(
         [p.time_s for p in photos],
@@ -245,12 +231,16 @@ def _pair(photos: Sequence[Photo], events: Sequence[ExposureEvent], motion: Pict
     )
 
 
-def _use_events(
-    photos: Sequence[Photo], pairing: Pairing, entry: LogSource, vehicle: str, findings: list[Finding]
-) -> None:
-    """Assign photos the poses of their events."""
+def _use_log(
+    photos: Sequence[Photo], entry: LogSource, pairing: Pairing, vehicle: str, findings: list[Finding], *,
+    workers: int,
+) -> None:  # fmt: skip
+    """Assign photos the poses of a log's events; pictures are read where the times do not decide."""
     entry.used = True
     log = entry.log
+    if pairing.doubtful and not pairing.jumps:
+        motion = picture_motion(photos, log, entry.timeline, workers)
+        pairing = _pair(photos, log.events, motion) if motion is not None else pairing
     far = list[tuple[Photo, float | None]]()
     explain(photos, _NO_EVENT, log.path.name)  # those that get a position below need no reason
     explain([photos[i] for i in pairing.open], _SEVERAL_WAYS, log.path.name)

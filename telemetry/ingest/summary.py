@@ -1,7 +1,11 @@
-"""The summary for `inspect`: sources, vehicles, legs and findings as plain data."""
+"""The summary for `inspect`: sources, vehicles, legs and findings as plain data.
+
+Control points and georeferenced rasters next to pictures are reported, not mapped.
+"""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -11,7 +15,6 @@ from numpy.typing import NDArray
 
 from orthoswarm.model.frame import Frame
 from telemetry.ingest.discovery import natural_key
-from telemetry.ingest.side_files import control_point_findings, raster_finding, read_control_points
 from telemetry.ingest.survey import SourceInfo, Survey
 from telemetry.photos.picture_motion import heading_findings
 from telemetry.samples.course import ground_track, length_m, straight_legs
@@ -94,21 +97,18 @@ def _of_frames(vehicle: str, frames: Sequence[Frame], source: SourceInfo) -> dic
 def _of_samples(vehicle: str, samples: Sequence[Sample], shown: int) -> dict[str, Any]:
     placed = [s for s in samples if s.lat_deg is not None and s.lon_deg is not None]
     times = [s.time_s for s in samples if s.time_s is not None]
-    return {
-        "id": vehicle,
-        "frames": shown,
-        **_flown(_thinned(ground_track(placed)), times),
-        **_ranges(height_m=[s.height_m for s in samples], pitch_deg=[s.pitch_deg for s in samples]),
-    }
-
-
-def _thinned(ground: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Positions thinned to a least distance; the legs of a dense track are those of its thinned one."""
+    # The legs of a dense track are those of one thinned to a least distance.
+    ground = ground_track(placed)
     spaced: list[int] = []
     for i, point in enumerate(ground):
         if not spaced or np.hypot(*(point - ground[spaced[-1]])) >= _THINNED_M:
             spaced.append(i)
-    return ground[spaced] if spaced else np.zeros((0, 2))
+    return {
+        "id": vehicle,
+        "frames": shown,
+        **_flown(ground[spaced] if spaced else np.zeros((0, 2)), times),
+        **_ranges(height_m=[s.height_m for s in samples], pitch_deg=[s.pitch_deg for s in samples]),
+    }
 
 
 def _flown(ground: NDArray[np.float64], times: Sequence[float]) -> dict[str, Any]:
@@ -180,3 +180,82 @@ def one_line(source: dict[str, Any]) -> str:
 _NOUNS = {
     "frames": "picture", "sei": "SEI message", "klv": "KLV packet", "camera_events": "camera event", "poses": "pose",
 }  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class ControlPoints:
+    """Summary of an ODM control point file."""
+
+    rows: int  # number of observations
+    points: int  # number of points
+    heights: tuple[float, ...]  # their z values
+    widest: float  # largest column of a pixel
+    images: frozenset[str]  # lower-case names of pictures
+
+
+def read_control_points(path: Path) -> ControlPoints | None:
+    """Read an ODM `gcp_list.txt` (projection, then x y z column row image); None if it is another file."""
+    try:
+        if path.stat().st_size > 8 << 20:
+            return None
+        lines = path.read_text("utf-8", "replace").splitlines()
+    except OSError:
+        return None
+    points: dict[tuple[float, float], float] = {}
+    images, widest, rows = set(), 0.0, 0
+    for line in lines[1:]:
+        words = line.split()
+        try:
+            x, y, z, column, _ = (float(word) for word in words[:5])
+        except ValueError:
+            continue
+        if len(words) < 6 or Path(words[5]).suffix.lower() not in (".jpg", ".jpeg", ".tif", ".tiff", ".png", ".dng"):
+            continue
+        points[x, y] = z
+        images.add(words[5].lower())
+        widest, rows = max(widest, column), rows + 1
+    return ControlPoints(rows, len(points), tuple(points.values()), widest, frozenset(images)) if rows else None
+
+
+def control_point_findings(path: Path, points: ControlPoints, widths: Collection[int]) -> list[Finding]:
+    """Findings on control points, given the widths of the pictures near them."""
+    text = (
+        f"{path.name} holds {points.points} ground control points in {points.rows} pictures; mosaic uses them where "
+        "the file is given with --control"
+    )
+    found = [Finding("control-points", text, note=True)]
+    width = max(widths, default=0)
+    if width and points.widest > 1.05 * width:
+        found.append(
+            Finding(
+                "control-points-scale",
+                f"the pixels of {path.name} go up to column {points.widest:.0f}, but the pictures are {width} wide: "
+                "they belong to larger originals and have to be scaled",
+            )
+        )
+    if len(points.heights) > 2 and len(set(points.heights)) == 1:
+        text = f"all control points of {path.name} have the same height, {points.heights[0]:g} m: it was not measured"
+        found.append(Finding("control-points-height", text))
+    return found
+
+
+def raster_finding(path: Path) -> Finding | None:
+    """Finding that describes a georeferenced raster; None if it cannot be read."""
+    import rasterio
+    from rasterio.errors import RasterioError
+
+    try:
+        with rasterio.open(path) as raster:
+            gsd = abs(raster.transform.a)
+            crs = raster.crs.to_string() if raster.crs else "no CRS"
+            kind = raster.dtypes[0]
+            unit = " m" if raster.crs and raster.crs.is_projected else ""
+            what = "colours" if raster.count >= 3 and kind == "uint8" else "values, such as heights"
+            use = "--basemap" if what == "colours" else "--dem"
+            text = (
+                f"{path.name} is a georeferenced raster and no picture of a camera: {raster.width} x {raster.height}, "
+                f"{gsd:g}{unit} a pixel, {crs}, {raster.count} x {kind} {what}; give it with {use}"
+            )
+    except (RasterioError, OSError, ValueError):
+        return None
+    return Finding("raster", text, note=True)

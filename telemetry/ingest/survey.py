@@ -16,53 +16,39 @@ from telemetry.samples.sample import Sample
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoadOptions:
-    """Options for reading inputs.
+    """Options for reading inputs."""
 
-    Attributes:
-        every_m: distance between pictures extracted from a video, metres; None for the default of `picture_choice`.
-        every_s: seconds between them.
-        cache: folder for pictures extracted from videos; None makes one under the system's temporary folder.
-        exclude: files and folders that are left out (the output folder, for instance).
-        workers: threads that read.
-        run: maps a function over items in processes, for many photos; None: read in threads.
-        sei_layouts: files that describe private SEI messages; see `telemetry.formats.video.sei`.
-        camera: which sensor of cameras with several is mapped: wide, zoom or thermal; "" for the widest in colour.
-        band: which spectral band of multispectral cameras is mapped; "" for colour, else the one that shows most.
-        decode: False to read only the metadata of videos, without extracting pictures (for `inspect`).
-    """
-
+    # distance between pictures extracted from a video, metres; None for the default of `picture_choice`
     every_m: float | None = None
-    every_s: float | None = None
+    every_s: float | None = None  # seconds between them
+    # folder for pictures extracted from videos; None makes one under the system's temporary folder
     cache: Path | None = None
-    exclude: tuple[Path, ...] = ()
-    workers: int = field(default_factory=lambda: min(8, (os.cpu_count() or 1) * 2))
+    exclude: tuple[Path, ...] = ()  # files and folders that are left out (the output folder, for instance)
+    workers: int = field(default_factory=lambda: min(8, (os.cpu_count() or 1) * 2))  # threads that read
+    # which sensor of cameras with several is mapped: wide, zoom or thermal; "" for the widest in colour
     camera: str = ""
+    # which spectral band of multispectral cameras is mapped; "" for colour, else the one that shows most
     band: str = ""
-    decode: bool = True
+    decode: bool = True  # False to read only the metadata of videos, without extracting pictures (for `inspect`)
+    # maps a function over items in processes, for many photos; None: read in threads
     run: Callable[..., Iterator[Any]] | None = None
-    sei_layouts: tuple[Path, ...] = ()
+    sei_layouts: tuple[Path, ...] = ()  # files that describe private SEI messages; see `telemetry.formats.video.sei`
 
 
 @dataclass(slots=True, kw_only=True)
 class SourceInfo:
-    """One source for `inspect`: a folder of photos, a video, a log or a table.
+    """One source for `inspect`: a folder of photos, a video, a log or a table."""
 
-    Attributes:
-        path: relative to the inputs' root. kind: "photos", "video", "geo.txt" and so on.
-        counts: `frames`, `sei`, `klv`, `camera_events`. findings: what is suspicious about it.
-        frames: the frames. tracks: for sources without frames, the poses of each vehicle in order.
-        shown: number of pictures of each vehicle if it differs from the number of its frames.
-        sees: sensor and band of its pictures, as `Photo` has them.
-    """
-
-    path: str
-    kind: str
-    counts: Counter[str] = field(default_factory=Counter)
-    findings: list[Finding] = field(default_factory=list)
-    frames: list[Frame] = field(default_factory=list)
+    path: str  # relative to the inputs' root
+    kind: str  # "photos", "video", "geo.txt" and so on
+    counts: Counter[str] = field(default_factory=Counter)  # `frames`, `sei`, `klv`, `camera_events`
+    findings: list[Finding] = field(default_factory=list)  # what is suspicious about it
+    frames: list[Frame] = field(default_factory=list)  # the frames
+    # for sources without frames, the poses of each vehicle in order
     tracks: dict[str, list[Sample]] = field(default_factory=dict)
+    # number of pictures of each vehicle if it differs from the number of its frames
     shown: dict[str, int] = field(default_factory=dict)
-    sees: tuple[str, str] = ("", "")
+    sees: tuple[str, str] = ("", "")  # sensor and band of its pictures, as `Photo` has them
 
 
 @dataclass(slots=True, kw_only=True)

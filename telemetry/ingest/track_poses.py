@@ -39,8 +39,7 @@ _NO_LOG_FITS = (
     "no log that is here covers the times of these photos in any time zone; give the log of their flight, or a geo.txt"
 )
 _CLOCK_UNSET = "it was taken before the camera's clock was set, so that no log can place it; put a geo.txt next to it"
-_LEAST_PLACED = 5
-"""Photos with positions that it takes to find the camera's clock by them."""
+_LEAST_PLACED = 5  # photos with positions that it takes to find the camera's clock by them
 
 EVENT_FAR_M: Final = 60.0  # photos whose own position is farther than this from their camera event are reported
 _TRACK_FAR_M: Final = 10.0  # photos nearer than this to a log's track at their times do not contradict it

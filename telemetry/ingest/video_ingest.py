@@ -115,16 +115,9 @@ def _take(
     name = source.path
     try:
         extraction = extract(
-            scanned.path,
-            name,
-            options.cache or cache_folder(result.root),
-            poses=poses,
-            every_m=options.every_m,
-            every_s=options.every_s,
-            progress=progress,
-            found=scanned,
-            vehicle=vehicle,
-        )
+            scanned.path, name, options.cache or cache_folder(result.root), poses=poses, every_m=options.every_m,
+            every_s=options.every_s, progress=progress, found=scanned, vehicle=vehicle,
+        )  # fmt: skip
     except OSError:  # the folder for the pictures cannot be written: that is not this video's fault
         raise
     except Exception as error:

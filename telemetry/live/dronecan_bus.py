@@ -34,10 +34,7 @@ def open_bus(url: str) -> Any:
     """A python-can bus: "socketcan:can0", "slcan:/dev/ttyACM0", "udp_multicast:239.74.163.2", "virtual:name".
 
     A bit rate may follow an @ ("slcan:/dev/ttyACM0@500000"; default 1,000,000). Frames of messages other than those
-    that are read are filtered out, by the kernel if the interface supports it.
-
-    Raises:
-        InputError: it cannot be opened.
+    that are read are filtered out, by the kernel if the interface supports it. Raises InputError: it cannot be opened.
     """
     import can
 
@@ -79,8 +76,7 @@ class CanSource:
 
         Packets that are not CAN frames (other senders on a multicast group) are skipped.
 
-        Raises:
-            InputError: it cannot be opened. OSError, can.CanError: the connection broke.
+        Raises InputError: it cannot be opened; OSError, can.CanError: the connection broke.
         """
         from can import CanOperationError
 

@@ -19,8 +19,7 @@ from telemetry.formats.log.mavlink_poses import ExposureEvent, MavlinkPoses, fix
 from telemetry.samples.held_fixes import LOST_SIGMA_M, FixNews
 from telemetry.samples.sample import CAMERA_ANGLES, FLIGHT_ANGLES, Sample
 
-MAVLINK: Final = "MAVLink"
-"""The source that a vehicle's link is."""
+MAVLINK: Final = "MAVLink"  # the source that a vehicle's link is
 
 _POSITION = ("lat_deg", "lon_deg", "altitude_m", "sigma_m")
 _HELD_S = 0.3
@@ -111,13 +110,10 @@ class _Sources:
 
 @dataclass(frozen=True, slots=True)
 class LinkPose:
-    """A pose at a time, and its sources.
+    """A pose at a time, and its sources."""
 
-    Attributes:
-        sample: the pose. origin: source of its `position`, `height`, `angles` and `flight_yaw`, as far as known.
-    """
-
-    sample: Sample
+    sample: Sample  # the pose
+    # source of its `position`, `height`, `angles` and `flight_yaw`, as far as known
     origin: dict[str, str] = field(default_factory=dict)
 
 

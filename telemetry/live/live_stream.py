@@ -30,22 +30,14 @@ _RETRY_S = (0.5, 1.0, 2.0, 5.0)
 
 @dataclass(slots=True, kw_only=True)
 class LivePicture:
-    """One picture of a live stream.
+    """One picture of a live stream."""
 
-    Attributes:
-        number: counts the pictures since the stream was first opened.
-        rgb: uint8 (rows, columns, 3).
-        sample: its pose, None if the stream has none. origin: source of the pose.
-        time_s: UTC epoch seconds of the exposure by the stream, else of its arrival.
-        damaged: True if parts are predicted from lost data.
-    """
-
-    number: int
-    rgb: NDArray[np.uint8]
-    sample: Sample | None
-    origin: str
-    time_s: float
-    damaged: bool = False
+    number: int  # counts the pictures since the stream was first opened
+    rgb: NDArray[np.uint8]  # uint8 (rows, columns, 3)
+    sample: Sample | None  # its pose, None if the stream has none
+    origin: str  # source of the pose
+    time_s: float  # UTC epoch seconds of the exposure by the stream, else of its arrival
+    damaged: bool = False  # True if parts are predicted from lost data
 
 
 def open_stream(

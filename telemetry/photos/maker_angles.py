@@ -17,8 +17,7 @@ from typing import Final
 
 from telemetry.formats.photo import xmp
 
-Angles = tuple[float | None, float | None, float | None]
-"""Yaw, pitch, roll in degrees."""
+Angles = tuple[float | None, float | None, float | None]  # yaw, pitch, roll in degrees
 
 _DJI_NAMES = ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree")
 _FLIGHT_NAMES = ("FlightYawDegree", "FlightPitchDegree", "FlightRollDegree")

@@ -1,6 +1,6 @@
 """A photo and its tags: position, attitude, time and lens of its camera.
 
-Tags are only collected here, with their values unchanged; `telemetry.photos.attitude` decides which of several
+Tags are only collected here, with their values unchanged; `telemetry.photos.photo_frames` decides which of several
 yaws is the picture's, and `telemetry.ingest` merges photos with other sources.
 """
 
@@ -25,8 +25,7 @@ from telemetry.samples.sample import is_position
 from telemetry.samples.times import ZONE_UNKNOWN, epoch_of, parse_time
 from telemetry.samples.unreadable import Unreadable, read_or_reason
 
-Run = Callable[..., Iterator[Any]]
-"""Maps a function over items, in order."""
+Run = Callable[..., Iterator[Any]]  # maps a function over items, in order
 
 HEMISPHERE_UNKNOWN = "without hemisphere, taken as north and east"
 """End of the origin of a position whose signs are not known."""
@@ -53,64 +52,42 @@ _MOST_HEIGHT_M: Final = 12_000.0  # recorded heights above this are not heights 
 
 @dataclass(slots=True, kw_only=True)
 class Photo:
-    """One photo with its tags, and what tables and logs add to them.
+    """One photo with its tags, and what tables and logs add to them."""
 
-    Attributes:
-        path: the file. width: columns as stored; height: rows.
-        lat_deg: latitude, None without a position; lon_deg: longitude.
-        other_position: another latitude and longitude that the photo's tags state, far from that.
-        altitude_m: absolute altitude. other_altitude_m: another one that the photo's tags state, far from that.
-        height_m: height above takeoff.
-        height_is_ground: whether height_m is above the ground instead.
-        time_s: UTC epoch seconds.
-        camera_deg: yaw, pitch, roll of the camera (gimbal), pitch -90 looking straight down.
-        flight_deg: yaw, pitch, roll of the airframe.
-        position_sigma_m: horizontal, one sigma, where stated.
-        make: manufacturer; model: of the camera. camera: key of the lens (model, size, zoom, sensor).
-        band: name of the spectral band, "" for a colour picture.
-        sensor: which of a camera's several took it, a key of SENSORS; "" if it has one.
-        fov_hint_rad: horizontal field of view from focal length tags.
-        dewarp_k1: radial distortion that the tags state for a picture which still has it.
-        yaw_is_stated: True if the source defines its yaw as the picture's, so that there is no choice.
-        origin: field -> its source.
-        damaged: True for a picture of a video that lost parts.
-        ambiguous: True where it may belong to another camera event of a log.
-        unplaced: why the logs that are there give it no position (one for all with that reason), and a detail.
-    """
-
-    path: Path
-    width: int
-    height: int
-    lat_deg: float | None = None
-    lon_deg: float | None = None
+    path: Path  # the file
+    width: int  # columns as stored
+    height: int  # rows
+    lat_deg: float | None = None  # latitude, None without a position
+    lon_deg: float | None = None  # longitude
+    # another latitude and longitude that the photo's tags state, far from that
     other_position: tuple[float, float] | None = None
-    altitude_m: float | None = None
-    other_altitude_m: float | None = None
-    height_m: float | None = None
-    height_is_ground: bool = False
-    time_s: float | None = None
-    camera_deg: Angles = (None, None, None)
-    flight_deg: Angles = (None, None, None)
-    position_sigma_m: float | None = None
-    make: str = ""
-    model: str = ""
-    camera: str = ""
-    band: str = ""
-    sensor: str = ""
-    fov_hint_rad: float | None = None
-    dewarp_k1: float | None = None
-    yaw_is_stated: bool = False
-    origin: dict[str, str] = field(default_factory=dict)
-    damaged: bool = False
-    ambiguous: bool = False
+    altitude_m: float | None = None  # absolute altitude
+    other_altitude_m: float | None = None  # another one that the photo's tags state, far from that
+    height_m: float | None = None  # height above takeoff
+    height_is_ground: bool = False  # whether height_m is above the ground instead
+    time_s: float | None = None  # UTC epoch seconds
+    camera_deg: Angles = (None, None, None)  # yaw, pitch, roll of the camera (gimbal), pitch -90 looking straight down
+    flight_deg: Angles = (None, None, None)  # yaw, pitch, roll of the airframe
+    position_sigma_m: float | None = None  # horizontal, one sigma, where stated
+    make: str = ""  # manufacturer
+    model: str = ""  # of the camera
+    camera: str = ""  # key of the lens (model, size, zoom, sensor)
+    band: str = ""  # name of the spectral band, "" for a colour picture
+    sensor: str = ""  # which of a camera's several took it, a key of SENSORS; "" if it has one
+    fov_hint_rad: float | None = None  # horizontal field of view from focal length tags
+    dewarp_k1: float | None = None  # radial distortion that the tags state for a picture which still has it
+    yaw_is_stated: bool = False  # True if the source defines its yaw as the picture's, so that there is no choice
+    origin: dict[str, str] = field(default_factory=dict)  # field -> its source
+    damaged: bool = False  # True for a picture of a video that lost parts
+    ambiguous: bool = False  # True where it may belong to another camera event of a log
+    # why the logs that are there give it no position (one for all with that reason), and a detail
     unplaced: tuple[str, str] = ("", "")
 
 
 def read_photo(path: Path) -> Photo | None:
     """Read the tags of one photo; None for a georeferenced raster, which is not a photo.
 
-    Raises:
-        NotAPicture: the file is not a readable picture; its text is the reason.
+    Raises NotAPicture: the file is not a readable picture; its text is the reason.
     """
     container = read_container(path)
     if container.georeferenced:
@@ -125,8 +102,7 @@ def read_photo(path: Path) -> Photo | None:
 def with_sidecar(path: Path, sidecar: Path) -> Photo:
     """The tags of a photo and of an XMP file beside it, which counts where both state something.
 
-    Raises:
-        NotAPicture: the photo is not readable. OSError: the other file is not.
+    Raises NotAPicture: the photo is not readable; OSError: the other file is not.
     """
     container = read_container(path)
     with sidecar.open("rb") as handle:
@@ -144,7 +120,10 @@ def read_photos(
         run: maps a function over items in processes, in order, where the photos are many and the disk is fast.
         progress: called with the number of photos done since the last call.
     """
-    chunks = [_chunk(paths[i : i + _CHUNK]) for i in range(0, len(paths), _CHUNK)]
+    chunks = []
+    for i in range(0, len(paths), _CHUNK):
+        own = paths[i : i + _CHUNK]
+        chunks.append((own, {path: file for path in own if is_stored(path) and (file := known(path)) is not None}))
     with ThreadPoolExecutor(max(1, workers)) as pool:
         for result in (run or pool.map)(_read_chunk, chunks):
             if progress is not None:
@@ -152,29 +131,14 @@ def read_photos(
             yield from result
 
 
-@dataclass(frozen=True, slots=True)
-class _Chunk:
-    """Photos to be read one after the other, and what is known about those in stores."""
-
-    paths: Sequence[Path]
-    stored: dict[Path, StoredFile]
-
-
-def _chunk(paths: Sequence[Path]) -> _Chunk:
-    found = ((path, known(path)) for path in paths if is_stored(path))
-    return _Chunk(paths, {path: file for path, file in found if file is not None})
-
-
-def _read_chunk(chunk: _Chunk) -> list[Photo | Unreadable | None]:
-    if not any(map(is_stored, chunk.paths)):
-        return list(map(_tags_or_reason, chunk.paths))
-    expect(chunk.stored)
+def _read_chunk(chunk: tuple[Sequence[Path], dict[Path, StoredFile]]) -> list[Photo | Unreadable | None]:
+    """Read photos one after the other, with what is known about those in stores."""
+    paths, stored = chunk
+    if not any(map(is_stored, paths)):
+        return [read_or_reason(read_photo, path) for path in paths]
+    expect(stored)
     with ThreadPoolExecutor(CONNECTIONS) as pool:  # a request mostly waits for the network
-        return list(pool.map(_tags_or_reason, chunk.paths))
-
-
-def _tags_or_reason(path: Path) -> Photo | Unreadable | None:
-    return read_or_reason(read_photo, path)
+        return list(pool.map(lambda path: read_or_reason(read_photo, path), paths))
 
 
 def tags_of(path: Path, container: Container) -> Photo:

@@ -8,7 +8,6 @@ the airframe instead of the camera. PictureFeatures are those of pictures decode
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -17,6 +16,7 @@ from orthoswarm.model.angles import wrap_deg
 from orthoswarm.model.arrays import Array, Floats
 from orthoswarm.model.frame import Frame
 from orthoswarm.raster.picture_file import PictureError, read_gray, reduction
+from telemetry.photos.photo_tags import Photo
 from telemetry.samples.course import Straight, ground_track, straight_legs
 from telemetry.samples.findings import Finding, plural
 
@@ -29,28 +29,15 @@ _YAW_LEAST_STEP_M: Final = 1.0  # distance flown between such pictures at least 
 
 
 @dataclass(frozen=True, slots=True)
-class PictureFile:
-    """A picture and its size in pixels."""
-
-    path: Path
-    width: int
-    height: int
-
-
-@dataclass(frozen=True, slots=True)
 class PictureFeatures:
-    """PictureFeatures of one picture at reduced size.
+    """PictureFeatures of one picture at reduced size."""
 
-    Attributes:
-        points: (N, 2) column and row. descriptors: (N, 128) float32. centre: (2,) column and row of the middle.
-    """
-
-    points: Array
-    descriptors: Floats
-    centre: Array
+    points: Array  # (N, 2) column and row
+    descriptors: Floats  # (N, 128) float32
+    centre: Array  # (2,) column and row of the middle
 
 
-def features(picture: PictureFile, *, width: int, most: int) -> PictureFeatures | None:
+def features(picture: Photo | Frame, *, width: int, most: int) -> PictureFeatures | None:
     """SIFT features of a picture reduced to a width in pixels; None where it cannot be decoded or shows too few."""
     import cv2
 
@@ -67,22 +54,16 @@ def features(picture: PictureFile, *, width: int, most: int) -> PictureFeatures 
     return PictureFeatures(np.array([p.pt for p in points]), descriptors, middle)
 
 
-@dataclass(frozen=True, slots=True)
-class Shift:
-    """How the ground in the middle of one picture moves to another.
+def centre_shift(one: PictureFeatures | None, two: PictureFeatures | None) -> tuple[Array, float] | None:
+    """How the ground in the middle of one picture moves to another: the similarity on which most matches agree.
 
-    Attributes:
-        pixels: (2,) columns and rows at the reduced size. turned_rad: clockwise as seen.
+    Returns columns and rows (2,) at the reduced size, and the turn in radians, clockwise as seen; None where too few
+    matches agree or a picture has no features.
     """
-
-    pixels: Array
-    turned_rad: float
-
-
-def centre_shift(one: PictureFeatures, two: PictureFeatures) -> Shift | None:
-    """The similarity on which most matches agree; None where too few do."""
     import cv2
 
+    if one is None or two is None:
+        return None
     pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(one.descriptors, two.descriptors, k=2)
     good = [p[0] for p in pairs if len(p) == 2 and p[0].distance < _MOTION_RATIO * p[1].distance]
     if len(good) < _MOTION_LEAST_INLIERS:
@@ -93,10 +74,10 @@ def centre_shift(one: PictureFeatures, two: PictureFeatures) -> Shift | None:
     if model is None or inliers.sum() < _MOTION_LEAST_INLIERS:
         return None
     shift = model[:, :2] @ one.centre + model[:, 2] - one.centre
-    return Shift(shift, float(np.arctan2(model[1, 0], model[0, 0])))
+    return shift, float(np.arctan2(model[1, 0], model[0, 0]))
 
 
-def shifts_px(pictures: Sequence[PictureFile], workers: int = 2) -> Array:
+def shifts_px(pictures: Sequence[Photo | Frame], workers: int = 2) -> Array:
     """(N - 1,) pixels, of pictures 320 wide, that the ground moves between consecutive pictures; 20 ms a picture.
 
     NaN where two do not match, or where the vehicle turned: the way around a turn is longer than the shift.
@@ -105,37 +86,29 @@ def shifts_px(pictures: Sequence[PictureFile], workers: int = 2) -> Array:
         found = list(pool.map(lambda picture: features(picture, width=320, most=250), pictures))
 
         def length(i: int) -> float:
-            one, two = found[i], found[i + 1]
-            shift = centre_shift(one, two) if one is not None and two is not None else None
-            straight = shift is not None and abs(shift.turned_rad) < _MOTION_MOST_TURN_RAD
-            return float(np.hypot(*shift.pixels)) if shift is not None and straight else float("nan")
+            pixels, turned_rad = centre_shift(found[i], found[i + 1]) or (np.full(2, np.nan), 0.0)
+            return float(np.hypot(*pixels)) if abs(turned_rad) < _MOTION_MOST_TURN_RAD else float("nan")
 
         return np.array(list(pool.map(length, range(len(pictures) - 1))), dtype=np.float64)
 
 
-@dataclass(frozen=True, slots=True)
-class _SeenHeading:
-    """The yaw measured on a leg: azimuth of the up direction of a picture (its index)."""
+def _seen_headings(frames: Sequence[Frame]) -> list[tuple[Straight, int, float]]:
+    """Straight legs of a vehicle, the index of a picture on each, and its yaw in degrees as measured in the pictures.
 
-    leg: Straight
-    picture: int
-    yaw_deg: float
-
-
-def _seen_headings(frames: Sequence[Frame]) -> list[_SeenHeading]:
-    """Yaw of each straight leg of a vehicle, measured in its pictures; legs that cannot be matched are left out."""
+    Legs that cannot be matched are left out.
+    """
     ground = ground_track([f.fix for f in frames])
     legs = straight_legs(ground)
     if len(legs) > _YAW_MOST_LEGS:
         legs = [legs[i] for i in np.linspace(0, len(legs) - 1, _YAW_MOST_LEGS).round().astype(int)]
-    found: list[_SeenHeading] = []
+    found: list[tuple[Straight, int, float]] = []
     for leg in legs:
         middle = (leg.first + leg.last) // 2
         order = sorted(range(leg.first, leg.last), key=lambda i: abs(i - middle))
         for i in order[:_YAW_PAIRS_A_LEG]:
             yaw_deg = _seen_yaw_deg(frames[i], frames[i + 1], ground[i + 1] - ground[i])
             if yaw_deg is not None:
-                found.append(_SeenHeading(leg, i + 1, yaw_deg))
+                found.append((leg, i + 1, yaw_deg))
                 break
     return found
 
@@ -144,28 +117,27 @@ def _seen_yaw_deg(a: Frame, b: Frame, moved: Array) -> float | None:
     """Yaw of the second of two pictures; None if they cannot be matched."""
     if np.hypot(*moved) < _YAW_LEAST_STEP_M:
         return None
-    one, two = (features(PictureFile(f.path, f.width, f.height), width=480, most=800) for f in (a, b))
-    matched = centre_shift(one, two) if one is not None and two is not None else None
-    if matched is None or np.hypot(*matched.pixels) < 4.0:
+    matched = centre_shift(*(features(f, width=480, most=800) for f in (a, b)))
+    if matched is None or np.hypot(*matched[0]) < 4.0:
         return None
     # In the second picture the first one's centre lies in the direction the camera came from; up is opposite to the
     # rows.
-    to_the_right_of_up = np.degrees(np.arctan2(-matched.pixels[0], matched.pixels[1]))
+    to_the_right_of_up = np.degrees(np.arctan2(-matched[0][0], matched[0][1]))
     course = np.degrees(np.arctan2(moved[0], moved[1]))
     return wrap_deg(float(course - to_the_right_of_up))
 
 
 def heading_findings(frames: Sequence[Frame], vehicle: str) -> list[Finding]:
     """Contradictions between recorded yaw and pictures, leg by leg."""
-    seen = [h for h in _seen_headings(frames) if frames[h.picture].fix.yaw_rad is not None]
+    seen = [(leg, yaw_deg, frames[i].fix.yaw_rad) for leg, i, yaw_deg in _seen_headings(frames)]
+    seen = [(leg, yaw_deg, recorded) for leg, yaw_deg, recorded in seen if recorded is not None]
     if not seen:
         return []
-    recorded = np.array([np.degrees(frames[h.picture].fix.yaw_rad or 0.0) for h in seen])
-    apart = wrap_deg(recorded - np.array([h.yaw_deg for h in seen]))
+    apart = wrap_deg(np.array([np.degrees(recorded or 0.0) - yaw_deg for _, yaw_deg, recorded in seen]))
     turned = np.abs(apart) > 130.0
     found: list[Finding] = []
     if turned.any():
-        ends = ((frames[h.leg.first].image, frames[h.leg.last].image) for h, t in zip(seen, turned) if t)
+        ends = ((frames[leg.first].image, frames[leg.last].image) for (leg, *_), t in zip(seen, turned) if t)
         text = (
             "the recorded yaw is turned by 180 degrees against the pictures on "
             f"{plural(int(turned.sum()), 'leg')} of {len(seen)} ({', '.join(f'{a} to {b}' for a, b in ends)})"

@@ -5,17 +5,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One observation about a source.
+    """One observation about a source."""
 
-    Attributes:
-        code: stable, lower case with hyphens. message: one plain sentence, with what was done about it.
-        vehicle: the vehicle concerned, "" for all. note: True for information that is not an error.
-    """
-
-    code: str
-    message: str
-    vehicle: str = ""
-    note: bool = False
+    code: str  # stable, lower case with hyphens
+    message: str  # one plain sentence, with what was done about it
+    vehicle: str = ""  # the vehicle concerned, "" for all
+    note: bool = False  # True for information that is not an error
 
     def __str__(self) -> str:
         return f"{self.vehicle}: {self.message}" if self.vehicle else self.message

@@ -46,18 +46,14 @@ _AROUND: Final = 3  # steps before and after by which the speed around a fix is 
 
 @dataclass(frozen=True, slots=True)
 class HeldFixes:
-    """Fixes (H of them) that were not measured.
+    """Fixes (H of them) that were not measured."""
 
-    Attributes:
-        index: of each in the caller's order. lat_deg, lon_deg: float64 (H,), between the measured ones, or the nearest
-            one. sigma_m: float64 (H,), one sigma of that. longest_s: the longest time without a measured fix.
-    """
-
-    index: list[int]
+    index: list[int]  # of each in the caller's order
+    # lat_deg, lon_deg: float64 (H,), between the measured ones, or the nearest one
     lat_deg: Array
     lon_deg: Array
-    sigma_m: Array
-    longest_s: float = 0.0
+    sigma_m: Array  # float64 (H,), one sigma of that
+    longest_s: float = 0.0  # the longest time without a measured fix
 
     def __len__(self) -> int:
         return len(self.index)
@@ -87,8 +83,7 @@ class HeldFixes:
 def held_fixes(times_s: Sequence[float | None], places: Sequence[tuple[float, float]]) -> HeldFixes:
     """The fixes of a flight that were not measured, and where the vehicle was.
 
-    Args:
-        times_s: of the fixes, in one clock; what has none is not judged. places: latitude and longitude in degrees.
+    times_s: of the fixes, in one clock; what has none is not judged. places: latitude and longitude in degrees.
     """
     order = sorted((i for i, t in enumerate(times_s) if t is not None and t == t), key=lambda i: times_s[i] or 0.0)
     none = np.zeros(0)
@@ -231,8 +226,7 @@ class FixNews:
     def hear(self, time_s: float, place: tuple[float, float], speed_m_s: float | None) -> float:
         """The sigma that a fix has besides the receiver's, metres: 0 for a new place, else by speed and age.
 
-        Args:
-            speed_m_s: as the vehicle states it, None: as it flew before.
+        speed_m_s: as the vehicle states it, None: as it flew before.
         """
         age_s = time_s - self._since_s
         if place == self._place:
@@ -250,8 +244,7 @@ def without_held_fixes(
 ) -> tuple[list[Sample], list[Finding]]:
     """One flight's samples whose held fixes lie between measured ones, or have no position; a finding if it matters.
 
-    Args:
-        times_s: of the samples, in one clock. source: name of the file, for the message.
+    times_s: of the samples, in one clock. source: name of the file, for the message.
     """
     placed = [i for i, sample in enumerate(samples) if sample.has_position]
     held = held_fixes([times_s[i] for i in placed], [samples[i].place for i in placed])

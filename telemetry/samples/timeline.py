@@ -16,8 +16,7 @@ from telemetry.samples.sample import CAMERA_ANGLES, FLIGHT_ANGLES, Sample
 
 _WRAPPED = (*CAMERA_ANGLES, *FLIGHT_ANGLES, "lon_deg")
 _FIELDS = ("lat_deg", "height_m", "altitude_m", "fov_deg", "zoom", "sigma_m", *_WRAPPED)
-_GROUND = "ground_m"
-"""Name of the series of heights above the ground below."""
+_GROUND = "ground_m"  # name of the series of heights above the ground below
 
 
 class Timeline:

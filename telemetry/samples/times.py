@@ -3,14 +3,11 @@
 import calendar
 import re
 
-ZONE_UNKNOWN = "without zone, taken as UTC"
-"""End of the origin of a time whose zone is not known."""
+ZONE_UNKNOWN = "without zone, taken as UTC"  # end of the origin of a time whose zone is not known
 GPS_EPOCH_S, WEEK_S = 315_964_800.0, 604_800.0
 """Start of GPS time (1980-01-06) in epoch seconds, and a GPS week in seconds."""
-GPS_MINUS_UTC_S, TAI_MINUS_UTC_S = 18.0, 37.0
-"""Leap seconds since 2017 (IERS Bulletin C)."""
-YEAR_2000_S = 946_684_800.0
-"""2000-01-01 in epoch seconds: a clock that is earlier was never set."""
+GPS_MINUS_UTC_S, TAI_MINUS_UTC_S = 18.0, 37.0  # leap seconds since 2017 (IERS Bulletin C)
+YEAR_2000_S = 946_684_800.0  # 2000-01-01 in epoch seconds: a clock that is earlier was never set
 
 _WRITTEN = re.compile(
     r"\s*(\d{4})[:\-/](\d{1,2})[:\-/](\d{1,2})[T ]+(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d+))?)?\s*"

@@ -22,16 +22,11 @@ _WILD_MOST_PIECES: Final = 10_000  # a track broken at more places has wrong tim
 
 @dataclass(frozen=True, slots=True)
 class WildFixes:
-    """The fixes of a track that no aircraft can have reached.
+    """The fixes of a track that no aircraft can have reached."""
 
-    Attributes:
-        indices: of the wild ones, in order of time. away_m: how far the farthest lies from its neighbours, metres.
-        doubtful: how many cannot be reached, where these are too many to be wild fixes.
-    """
-
-    indices: list[int]
-    away_m: float = 0.0
-    doubtful: int = 0
+    indices: list[int]  # of the wild ones, in order of time
+    away_m: float = 0.0  # how far the farthest lies from its neighbours, metres
+    doubtful: int = 0  # how many cannot be reached, where these are too many to be wild fixes
 
 
 def wild_fixes(times_s: Sequence[float | None], places: Sequence[tuple[float, float]]) -> WildFixes:
@@ -41,9 +36,7 @@ def wild_fixes(times_s: Sequence[float | None], places: Sequence[tuple[float, fl
     those are kept that can be flown one after the other and hold most fixes. If the others are more than a few, they
     are no wild fixes but another flight, or the times are wrong: then there are none, and their number is `doubtful`.
 
-    Args:
-        times_s: of the fixes, in one clock; what has none is not judged.
-        places: latitude and longitude in degrees.
+    times_s: of the fixes, in one clock; what has none is not judged. places: latitude and longitude in degrees.
     """
     timed = [i for i, t in enumerate(times_s) if t is not None and t == t]
     order = sorted(timed, key=lambda i: times_s[i] or 0.0)
@@ -113,8 +106,7 @@ def sound_positions(
 ) -> tuple[list[Sample], list[Finding]]:
     """One flight's samples without positions that were not measured (`held_fixes`) or are wild, and findings on them.
 
-    Args:
-        times_s: of the samples, in one clock. source: name of the file, for the message.
+    times_s: of the samples, in one clock. source: name of the file, for the message.
     """
     samples, told = without_held_fixes(samples, times_s, source)
     placed = [i for i, sample in enumerate(samples) if sample.has_position]

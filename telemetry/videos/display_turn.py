@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 from orthoswarm.model.camera import angles_from_rotation, focal_px, fov_rad, rotation_from_angles
 from telemetry.samples.sample import Sample
 
-_ONE = 65536.0
-"""The number one in the matrix (16.16 fixed point, ISO/IEC 14496-12, 6.2.2)."""
-_WITHIN = 0.05
-"""A matrix that is farther than this from quarter turns and mirrors is not one of a camera."""
+_ONE = 65536.0  # the number one in the matrix (16.16 fixed point, ISO/IEC 14496-12, 6.2.2)
+_WITHIN = 0.05  # A matrix that is farther than this from quarter turns and mirrors is not one of a camera
 
 
 @dataclass(frozen=True, slots=True)

@@ -40,19 +40,13 @@ class Extraction:
 
 @dataclass(frozen=True, slots=True)
 class _WrittenPicture:
-    """One picture in the cache folder.
+    """One picture in the cache folder."""
 
-    Attributes:
-        number: of the picture in the video, in order of presentation.
-        packet: index of its packet, None if the decoder did not report it.
-        columns: width in pixels; rows: height. damaged: whether it lost parts.
-    """
-
-    number: int
-    packet: int | None
-    columns: int
-    rows: int
-    damaged: bool = False
+    number: int  # of the picture in the video, in order of presentation
+    packet: int | None  # index of its packet, None if the decoder did not report it
+    columns: int  # width in pixels
+    rows: int  # height
+    damaged: bool = False  # whether it lost parts
 
     @property
     def name(self) -> str:
@@ -61,19 +55,13 @@ class _WrittenPicture:
 
 @dataclass(slots=True)
 class _Written:
-    """The pictures in the cache folder, and what became of the others.
+    """The pictures in the cache folder, and what became of the others."""
 
-    Attributes:
-        pictures: the extracted ones. seen: number decoded. without_pose: number left out for lack of a position.
-        on_ground: number left out because they were taken on the ground.
-        damaged: number that lost parts or could not be decoded.
-    """
-
-    pictures: list[_WrittenPicture] = field(default_factory=list)
-    seen: int = 0
-    without_pose: int = 0
-    on_ground: int = 0
-    damaged: int = 0
+    pictures: list[_WrittenPicture] = field(default_factory=list)  # the extracted ones
+    seen: int = 0  # number decoded
+    without_pose: int = 0  # number left out for lack of a position
+    on_ground: int = 0  # number left out because they were taken on the ground
+    damaged: int = 0  # number that lost parts or could not be decoded
 
 
 def decoded(found: VideoScan, damage: Damage | None = None) -> Iterator[tuple[int, int | None, Any]]:
@@ -233,8 +221,7 @@ def extract(
     Args:
         name: of the video relative to the inputs; names its folder in `cache`, the folder for the pictures.
         poses: of its pictures, including those from other files; None for those in the file itself.
-        every_m: spacing in metres. every_s: in seconds.
-        progress: called with pictures decoded and their number.
+        every_m: spacing in metres. every_s: in seconds. progress: called with pictures decoded and their number.
         found: the file's metadata if it was scanned already.
         vehicle: id of the vehicle if the metadata names none; None for the file's name.
 
@@ -255,7 +242,8 @@ def extract(
             rows, columns = rgb.shape[:2]
             written.pictures.append(_WrittenPicture(picture.number, picture.packet, columns, rows, picture.damaged))
             _write(folder / written.pictures[-1].name, encode_jpeg(rgb))
-        _remember(folder, key, written)
+        document = {"key": key, **asdict(written), "pictures": [astuple(picture) for picture in written.pictures]}
+        _write(folder / _LIST, json.dumps(document).encode())  # once all pictures are in the folder
     result, lens = Extraction(), _LensKey(found)
     for one in written.pictures:
         pose = None if one.packet is None else poses.of(one.packet)
@@ -311,12 +299,6 @@ def _recall(folder: Path, key: str) -> _Written | None:
         return _Written(kept, **document) if all((folder / one.name).stat().st_size for one in kept) else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
-
-
-def _remember(folder: Path, key: str, written: _Written) -> None:
-    """Write the list, once all pictures are in the folder."""
-    document = {"key": key, **asdict(written), "pictures": [astuple(picture) for picture in written.pictures]}
-    _write(folder / _LIST, json.dumps(document).encode())
 
 
 def encode_jpeg(rgb: NDArray[np.uint8]) -> bytes:

@@ -19,10 +19,7 @@ _CHUNK_PACKETS = 1 << 17
 def transport_gaps(path: Path, pid: int) -> list[tuple[int, int]]:
     """Where packets of a stream are missing from an MPEG-TS file: offsets of the packets before and after each gap.
 
-    Empty for files of other kinds.
-
-    Raises:
-        OSError: it cannot be read.
+    Empty for files of other kinds. Raises OSError: it cannot be read.
     """
     gaps: list[tuple[int, int]] = []
     last: tuple[int, int] | None = None  # counter and offset

@@ -24,21 +24,15 @@ _LEAST_FLOWN_HEIGHT_M: Final = 5.0  # a video whose heights reach this was recor
 
 @dataclass(slots=True, kw_only=True)
 class DecodedPicture:
-    """A picture of a video as decoded, that may be selected.
+    """A picture of a video as decoded, that may be selected."""
 
-    Attributes:
-        number: in order of presentation. frame: as decoded. sample: its pose. video_s: its time in the video.
-        origin: source of the pose. packet: index of its packet, None if the decoder did not report it.
-        damaged: whether it lost parts.
-    """
-
-    number: int
-    frame: Any
-    sample: Sample | None
-    video_s: float
-    origin: str = ""
-    packet: int | None = None
-    damaged: bool = False
+    number: int  # in order of presentation
+    frame: Any  # as decoded
+    sample: Sample | None  # its pose
+    video_s: float  # its time in the video
+    origin: str = ""  # source of the pose
+    packet: int | None = None  # index of its packet, None if the decoder did not report it
+    damaged: bool = False  # whether it lost parts
 
 
 class Picker:

@@ -73,7 +73,9 @@ class Poses:
         self._djmd_times = np.array([row[0] for row in self._djmd])
         # Whole seconds: the largest difference belongs to a time at which the second had just begun.
         self._djmd_clock = max((s.time_s - t for t, s in self._djmd if s.time_s is not None), default=None)
-        self._times = np.array([self._time(i) for i in range(len(found.pictures))], dtype=np.float64)
+        rated = (i * self._interval if found.rate else float("nan") for i in range(len(found.pictures)))
+        known = [note.video_s for note in found.pictures]
+        self._times = np.array([other if t is None else t for t, other in zip(known, rated)], dtype=np.float64)
         self._trust_sei_times = True
         self._interpolated: list[tuple[str, list[Sample]]] = []
         self._sei = self._sei_samples()
@@ -167,13 +169,6 @@ class Poses:
         table = np.array(rows, dtype=np.float64).reshape(-1, 3)
         return table[:, 0], table[:, 1:]
 
-    def _time(self, index: int) -> float:
-        """Video time of a packet's picture; NaN if unknown."""
-        t = self._scan.pictures[index].video_s
-        if t is not None:
-            return t
-        return index * self._interval if self._scan.rate else float("nan")
-
     def _own_djmd(self, t: float) -> Sample | None:
         """The djmd message with the picture's own time."""
         if not self._djmd or t != t:
@@ -225,13 +220,6 @@ class Poses:
         found = self._scan
         return found.turn.sample(sample, *square_size(found.width, found.height, found.aspect))
 
-    def _sei_clock(self) -> VideoClock:
-        return VideoClock(
-            (n.video_s, n.sample.time_s)
-            for n in self._scan.pictures
-            if n.video_s is not None and n.sample is not None and n.sample.time_s is not None
-        )
-
     def _klv_rows(self) -> list[tuple[float, Sample]]:
         """KLV poses with video times: their own, else from UTC and the SEI times, else from their place in the file."""
         rows = [
@@ -241,7 +229,8 @@ class Poses:
         ]
         if not rows:
             return []
-        sei_clock = self._sei_clock()
+        own = ((n.video_s, n.sample.time_s) for n in self._scan.pictures if n.sample is not None)
+        sei_clock = VideoClock((t, utc_s) for t, utc_s in own if t is not None and utc_s is not None)
         dated = ((t, s.time_s) for t, _, s in rows if t is not None and s.time_s is not None)
         self._compare_clocks(sei_clock, VideoClock(dated))
         if all(t is not None for t, _, _ in rows):
@@ -350,20 +339,18 @@ class Poses:
 
 
 def _interpolated(rows: list[tuple[float, Sample]], times: Array) -> list[Sample]:
-    """Samples with video times at other video times; their UTC goes on beyond them."""
+    """Samples with video times at other video times; their UTC goes on beyond them.
+
+    They are extended at their ends by one usual interval (at most a second), as pictures lie between samples.
+    """
     utc = VideoClock((t, s.time_s) for t, s in rows if s.time_s is not None).at(times)
-    samples = _held_timeline([replace(s, time_s=t) for t, s in rows]).at_all(times)
+    known = [replace(s, time_s=t) for t, s in sorted(rows, key=lambda row: row[0])]
+    moments = np.array([t for t, _ in rows], dtype=np.float64)
+    usual = float(np.median(np.diff(np.sort(moments)))) if len(rows) > 1 else _HELD_AT_ENDS_S
+    usual = min(max(usual, 1e-3), _HELD_AT_ENDS_S)
+    before = replace(known[0], time_s=float(moments.min()) - usual)
+    after = replace(known[-1], time_s=float(moments.max()) + usual)
+    samples = Timeline([before, *known, after], max_gap_s=max(2.0, 4.0 * usual)).at_all(times)
     for sample, moment in zip(samples, utc.tolist(), strict=True):
         sample.time_s = moment if moment == moment else None
     return samples
-
-
-def _held_timeline(samples: list[Sample]) -> Timeline:
-    """A timeline extended at its ends by one usual interval (at most a second), as pictures lie between samples."""
-    samples = sorted((s for s in samples if s.time_s is not None), key=lambda s: s.time_s or 0.0)
-    times = np.array([s.time_s for s in samples], dtype=np.float64)
-    usual = float(np.median(np.diff(times))) if len(times) > 1 else _HELD_AT_ENDS_S
-    usual = min(max(usual, 1e-3), _HELD_AT_ENDS_S)
-    before = replace(samples[0], time_s=float(times[0]) - usual)
-    after = replace(samples[-1], time_s=float(times[-1]) + usual)
-    return Timeline([before, *samples, after], max_gap_s=max(2.0, 4.0 * usual))

@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
@@ -106,52 +105,37 @@ class NotAVideo(Unreadable):
 
 @dataclass(slots=True)
 class PictureNote:
-    """Metadata of one picture's packet.
+    """Metadata of one picture's packet."""
 
-    Attributes:
-        video_s: its time in the video. sample: its own pose. decoders: names of the decoders that understood it.
-        position: offset of the packet in the file, None if the container does not give it.
-    """
-
-    video_s: float | None
-    sample: Sample | None = None
-    decoders: tuple[str, ...] = ()
-    position: int | None = None
+    video_s: float | None  # its time in the video
+    sample: Sample | None = None  # its own pose
+    decoders: tuple[str, ...] = ()  # names of the decoders that understood it
+    position: int | None = None  # offset of the packet in the file, None if the container does not give it
 
 
 @dataclass(slots=True, kw_only=True)
 class VideoScan:
-    """All metadata of a video file.
+    """All metadata of a video file."""
 
-    Attributes:
-        path: the file. codec: of the pictures. width: columns; height: rows.
-        rate: pictures a second, None if not given.
-        created_s: UTC epoch seconds of the container's creation time.
-        pictures: one for each video packet, in order of the file.
-        klv_packets: video time (None if unknown), number of video packets before it, packet.
-        djmd_samples, gpmf_samples: video time and sample. cues: of a subtitle track.
-        unknown_sei: (UUID, size) -> number of private SEI messages without a decoder.
-        joints_s: times at which the file's clock starts again (recordings joined); times continue over them.
-        aspect: width of a pixel over its height. others: width and height of other video streams.
-        turn: how a player turns the pictures.
-    """
-
-    path: Path
-    codec: str
-    width: int
-    height: int
-    rate: float | None = None
-    created_s: float | None = None
-    pictures: list[PictureNote] = field(default_factory=list)
+    path: Path  # the file
+    codec: str  # of the pictures
+    width: int  # columns
+    height: int  # rows
+    rate: float | None = None  # pictures a second, None if not given
+    created_s: float | None = None  # UTC epoch seconds of the container's creation time
+    pictures: list[PictureNote] = field(default_factory=list)  # one for each video packet, in order of the file
+    # video time (None if unknown), number of video packets before it, packet
     klv_packets: list[tuple[float | None, int, klv.KlvPacket]] = field(default_factory=list)
-    djmd_samples: list[tuple[float, Sample]] = field(default_factory=list)
-    gpmf_samples: list[tuple[float, Sample]] = field(default_factory=list)
-    cues: srt.Subtitles = field(default_factory=srt.Subtitles)
+    djmd_samples: list[tuple[float, Sample]] = field(default_factory=list)  # video time and sample
+    gpmf_samples: list[tuple[float, Sample]] = field(default_factory=list)  # video time and sample
+    cues: srt.Subtitles = field(default_factory=srt.Subtitles)  # of a subtitle track
+    # (UUID, size) -> number of private SEI messages without a decoder
     unknown_sei: Counter[tuple[str, int]] = field(default_factory=Counter)
+    # times at which the file's clock starts again (recordings joined); times continue over them
     joints_s: list[float] = field(default_factory=list)
-    aspect: float = 1.0
-    others: list[tuple[int, int]] = field(default_factory=list)
-    turn: Turn = AS_CODED
+    aspect: float = 1.0  # width of a pixel over its height
+    others: list[tuple[int, int]] = field(default_factory=list)  # width and height of other video streams
+    turn: Turn = AS_CODED  # how a player turns the pictures
 
     @property
     def has_times(self) -> bool:
@@ -165,11 +149,7 @@ class VideoScan:
 
 
 def open_video(path: Path | str, **options: Any) -> Any:
-    """Open a file or a URL with PyAV.
-
-    Raises:
-        NotAVideo: it cannot be opened or holds no video.
-    """
+    """Open a file or a URL with PyAV. Raises NotAVideo: it cannot be opened or holds no video."""
     import av
 
     try:
@@ -255,11 +235,7 @@ def _reason(error: Exception) -> str:
 
 
 def scan(path: Path) -> VideoScan:
-    """Read all metadata of a file, without decoding pictures.
-
-    Raises:
-        NotAVideo: it is not a video.
-    """
+    """Read all metadata of a file, without decoding pictures. Raises NotAVideo: it is not a video."""
     if path.stat().st_size == 0:
         raise NotAVideo("the file is empty; copy it again")
     with open_video(path) as container:
@@ -269,19 +245,14 @@ def scan(path: Path) -> VideoScan:
         result.aspect = float(stream.sample_aspect_ratio or 1)
         contexts = [s.codec_context for s in moving_streams(container) if s is not stream]
         result.others = [(c.width, c.height) for c in contexts if c is not None]
-        result.rate = _rate(container, stream)
+        stated = context.framerate if container.format.name in _RAW_FORMATS else stream.average_rate
+        result.rate = float(stated) if stated else None  # of a raw stream without a rate FFmpeg would assume 25
         result.created_s = epoch_of(str(container.metadata.get("creation_time", "")))
         _scan_packets(container, stream, result)
     if not result.pictures:
         raise NotAVideo("the file holds no pictures; it may be cut off")
     result.turn = _turn(path)
     return result
-
-
-def _rate(container: Any, stream: Any) -> float | None:
-    """Pictures a second; of a raw stream what its sequence parameters state, without which FFmpeg assumes 25."""
-    stated = stream.codec_context.framerate if container.format.name in _RAW_FORMATS else stream.average_rate
-    return float(stated) if stated else None
 
 
 def _turn(path: Path) -> Turn:
@@ -326,7 +297,17 @@ def _scan_packets(container: Any, stream: Any, result: VideoScan) -> None:
     texts: list[tuple[float, float, str]] = []
     leftovers: dict[int, bytes] = {}
     ahead: list[tuple[Any, int, float | None]] = []  # metadata of a part whose pictures have not begun
-    read = partial(_scan_metadata, result=result, texts=texts, leftovers=leftovers)
+
+    def read(packet: Any, seconds: float | None) -> None:
+        if packet.stream.type == "data":
+            _scan_data(packet, seconds, result, leftovers)
+        elif seconds is not None:
+            data = bytes(packet)
+            if len(data) >= 2 and data[0] == 0 and int.from_bytes(data[:2], "big") <= len(data) - 2:
+                data = data[2 : 2 + int.from_bytes(data[:2], "big")]  # MP4's timed text leads it with its length
+            length = float((packet.duration or 0) * packet.time_base)
+            texts.append((seconds, seconds + length, data.decode("utf-8", "replace")))
+
     for packet in demux(container, wanted):
         if packet.size == 0:
             continue
@@ -340,8 +321,11 @@ def _scan_packets(container: Any, stream: Any, result: VideoScan) -> None:
         if len(result.pictures) >= _MAX_PICTURES:
             break
         parts = times.parts
-        note = _note(bytes(packet), form, times.picture(part, seconds), result.unknown_sei)
-        note.position = packet.pos
+        note = PictureNote(times.picture(part, seconds), position=packet.pos)
+        messages = [] if form is None else bitstream.sei_messages(bytes(packet), form)
+        result.unknown_sei.update(sei.unknown(messages))
+        if (reading := sei.read(messages)) is not None:
+            note.sample, note.decoders = reading.sample, reading.decoders
         result.pictures.append(note)
         if times.parts > parts:
             for other, its_part, moment in (each for each in ahead if each[1] < times.parts):
@@ -352,38 +336,6 @@ def _scan_packets(container: Any, stream: Any, result: VideoScan) -> None:
     result.joints_s = times.joints_s
     if texts:
         result.cues = srt.parse_cues(texts)
-
-
-def _scan_metadata(
-    packet: Any,
-    seconds: float | None,
-    result: VideoScan,
-    *,
-    texts: list[tuple[float, float, str]],
-    leftovers: dict[int, bytes],
-) -> None:
-    """A packet of subtitles or data."""
-    if packet.stream.type == "data":
-        _scan_data(packet, seconds, result, leftovers)
-    elif seconds is not None:
-        length = float((packet.duration or 0) * packet.time_base)
-        texts.append((seconds, seconds + length, _subtitle_text(bytes(packet))))
-
-
-def _note(
-    data: bytes, form: bitstream.StreamFormat | None, seconds: float | None, unknown: Counter[tuple[str, int]]
-) -> PictureNote:
-    messages = [] if form is None else bitstream.sei_messages(data, form)
-    reading = sei.read(messages)
-    unknown.update(sei.unknown(messages))
-    return PictureNote(seconds) if reading is None else PictureNote(seconds, reading.sample, reading.decoders)
-
-
-def _subtitle_text(data: bytes) -> str:
-    """Text of a subtitle packet: MP4's timed text leads it with a 16-bit length."""
-    if len(data) >= 2 and int.from_bytes(data[:2], "big") <= len(data) - 2 and data[0] == 0:
-        data = data[2 : 2 + int.from_bytes(data[:2], "big")]
-    return data.decode("utf-8", "replace")
 
 
 def _scan_data(packet: Any, seconds: float | None, result: VideoScan, leftovers: dict[int, bytes]) -> None:

@@ -69,8 +69,7 @@ def add_sei(source: Path, target: Path, pose_of: PoseOf) -> int:
 def presentation_order(path: Path) -> list[int]:
     """For each video packet of a file its picture's number in order of presentation.
 
-    Raises:
-        NotAVideo: it is not a video.
+    Raises NotAVideo: it is not a video.
     """
     with open_video(path) as container:
         stream = picture_stream(container)

@@ -16,15 +16,13 @@ MAKE = "OrthoSwarm"
 _NOMINAL_SENSOR_MM = 36.0
 
 _ASCII, _SHORT, _LONG, _RATIONAL, _BYTE, _UNDEFINED = 2, 3, 4, 5, 1, 7
-Entry = tuple[int, int, int, bytes]
-"""Tag, type, count, value."""
+Entry = tuple[int, int, int, bytes]  # tag, type, count, value
 
 
 def with_pose(jpeg: bytes, frame: Frame) -> bytes:
     """A JPEG with a frame's pose; existing EXIF and XMP are replaced, the picture data is unchanged.
 
-    Raises:
-        ValueError: the bytes are not a JPEG.
+    Raises ValueError: the bytes are not a JPEG.
     """
     if jpeg[:2] != b"\xff\xd8":
         raise ValueError("no JPEG")

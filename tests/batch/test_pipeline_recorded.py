@@ -11,7 +11,7 @@ from orthoswarm.model.frame import TAGGED_TILT_SIGMA, THETA_HAT_DEG, UNSTATED_SI
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.mosaic.recorded_pose import area_grid, recorded_cameras
 from orthoswarm.refine.flight.unsolved_pictures import few_of_their_kind, hovering_vehicles, place_by_neighbours
-from orthoswarm.trajectory.courses import course
+from orthoswarm.trajectory.legs import course
 
 GRID = LocalGrid(32632)
 MIDDLE = np.array([465_000.0, 5_250_000.0])

@@ -6,12 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthoswarm.change.change_map import ChangeMap
+from orthoswarm.change.change_files import painted
+from orthoswarm.change.change_map import ChangeMap, hidden_on_map, local_offsets, shifted
 from orthoswarm.change.changed_objects import CHANGED, NEW_OBJECT, find_objects
-from orthoswarm.change.likelihood import CASES, probabilities
+from orthoswarm.change.evidence import CASES, probabilities
 from orthoswarm.change.looks import ToneModel
-from orthoswarm.change.map_ground import hidden_on_map, local_offsets, shifted
-from orthoswarm.change.overlay import painted
 from orthoswarm.change.seen_ground import heights_on, seen_ground
 from orthoswarm.change.structure import structure
 from orthoswarm.coverage.view import View

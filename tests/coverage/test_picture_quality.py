@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from orthoswarm.coverage.picture_flaws import picture_flaws
-from orthoswarm.coverage.view import Flaw
+from orthoswarm.coverage.view import Flaw, picture_flaws
 from orthoswarm.raster.picture_file import read_gray
 from orthoswarm.raster.picture_quality import picture_quality
 

@@ -55,7 +55,7 @@ def test_other_ground_is_not_matched():
         field = displacement_field(other, ALL, shifted(texture(1), 0, 0), ALL, settings=SETTINGS)
         assert len(field.matched) == 20
         assert field.matched.mean() < 0.15
-    measured = accuracy(field, completeness(ALL, ALL, 0.5), 40.0)
+    measured = accuracy(field, completeness(ALL, ALL), 40.0)
     assert measured.unmatched_share > 0.9
     assert measured.share_within_1m < 0.1
 
@@ -90,10 +90,10 @@ def test_blocks_that_the_orthoimage_does_not_cover_do_not_count():
 def test_holes_lower_completeness_and_the_outside_does_not():
     valid = np.zeros((100, 100), bool)
     valid[20:80, 20:80] = True
-    assert completeness(valid, np.ones((100, 100), bool), 0.5).share == 1.0
+    assert completeness(valid, np.ones((100, 100), bool)) == 1.0
     valid[40:60, 40:60] = False
-    assert completeness(valid, np.ones((100, 100), bool), 0.5).share == pytest.approx(1 - 400 / 3600, abs=0.01)
-    assert completeness(np.zeros((9, 9), bool), np.ones((9, 9), bool), 0.5).share == 0.0
+    assert completeness(valid, np.ones((100, 100), bool)) == pytest.approx(1 - 400 / 3600, abs=0.01)
+    assert completeness(np.zeros((9, 9), bool), np.ones((9, 9), bool)) == 0.0
 
 
 small = st.floats(-0.3, 0.3)

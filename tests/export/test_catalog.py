@@ -19,7 +19,7 @@ from orthoswarm.export.catalog import tiled_raster
 from orthoswarm.export.catalog.stac_collection import write_collection
 from orthoswarm.export.catalog.tiled_raster import in_tiles, product_file, write_tiled
 from orthoswarm.export.product_files import iso_time, write_frames
-from orthoswarm.export.surface_file import write_surface
+from orthoswarm.export.value_raster import write_surface
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.stereo.surface_cells import SurfaceModel

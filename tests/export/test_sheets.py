@@ -20,10 +20,10 @@ from orthoswarm.export.forms import FORMS, MapExport
 from orthoswarm.export.sheets.geopdf import grid_zone, square, utm_zone, write_geopdf
 from orthoswarm.export.sheets.stac_item import write_stac_item
 from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
-from orthoswarm.export.surface_file import write_surface
 from orthoswarm.export.tactical.places import FILE, Place, write_geojson
 from orthoswarm.export.tiles.mbtiles import write_mbtiles, write_pmtiles
 from orthoswarm.export.tiles.tile_pyramid import ReducedRaster
+from orthoswarm.export.value_raster import write_surface
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.stereo.surface_cells import SurfaceModel
 

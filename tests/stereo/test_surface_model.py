@@ -7,7 +7,7 @@ import pytest
 import rasterio
 
 from gcs_plugin.cli.main import main
-from orthoswarm.export.surface_file import write_surface
+from orthoswarm.export.value_raster import write_surface
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.report.report_pictures import relief
 from orthoswarm.stereo.surface_cells import SurfaceModel

@@ -289,7 +289,7 @@ def _check_written(args: argparse.Namespace) -> None:
     refuse_replacing("--surface", args.surface, read)
     folders = {path.resolve() for path in args.inputs if path.is_dir()}
     if args.surface.exists() and not folders.isdisjoint(args.surface.resolve().parents):
-        from orthoswarm.export.surface_file import is_surface
+        from orthoswarm.export.value_raster import is_surface
 
         if not is_surface(args.surface):
             raise InputError(f"--surface {args.surface} would replace a file of INPUT; choose another name")

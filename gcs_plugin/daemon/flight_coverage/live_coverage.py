@@ -362,8 +362,7 @@ class LiveCoverage(Background):
         if self._due is not True:  # pictures of the newest ones may still arrive
             last = max((event.time_s for event in events), default=0.0) - _ON_THE_WAY_S
             events = [event for event in events if event.time_s <= last]
-        found = missing_by_events(here.cover.views, events, self._views.rejected())
-        return found.pictures, found.warnings
+        return missing_by_events(here.cover.views, events, self._views.rejected())
 
 
 def _with_flaws(views: Iterable[View], flaws: FlawedPictures) -> list[View]:

@@ -14,8 +14,7 @@ from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.picture_store import PictureStore
 from gcs_plugin.daemon.store.sortie_rows import solution_paths
 from orthoswarm.coverage.missing_pictures import Exposure
-from orthoswarm.coverage.picture_flaws import NEIGHBOURS, picture_flaws
-from orthoswarm.coverage.view import NO_FLAW, Flaw, View
+from orthoswarm.coverage.view import NEIGHBOURS, NO_FLAW, Flaw, View, picture_flaws
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.mosaic.recorded_pose import recorded_cameras
 from orthoswarm.raster.picture_quality import PictureQuality

@@ -15,9 +15,8 @@ from orthoswarm.model.earth import distance_m
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Frame
 from telemetry.live.live_poses import LinkPoses
-from telemetry.samples import sample_frame
-from telemetry.samples.sample import Sample
-from telemetry.samples.sample_frame import sample_of
+from telemetry.samples.sample import Sample, sample_of
+from telemetry.samples.sample import frame_of as frame_of_sample
 
 MOST_TEXT: Final = 1 << 20
 _OPTIONAL: Final = {
@@ -118,7 +117,7 @@ def frame_of(values: Mapping[str, Any], *, image: str, path: Path, vehicle: str,
     sample.height_is_ground = bool(values.get("height_is_ground"))
     if not is_position(values):
         sample.lat_deg = sample.lon_deg = 0.0  # kept without a place, until the vehicle's link says where it was
-    frame = sample_frame.frame_of(sample, image=image, path=path, vehicle=vehicle, width=size[0], height=size[1])
+    frame = frame_of_sample(sample, image=image, path=path, vehicle=vehicle, width=size[0], height=size[1])
     assert frame is not None
     return replace(frame, origin=values.get("origin", {}), damaged=bool(values.get("damaged")))
 

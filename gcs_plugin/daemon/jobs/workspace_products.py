@@ -80,8 +80,7 @@ def write_products(task: ExportTask) -> dict[str, str]:
     from orthoswarm.export.product_files import write_frames, write_json
     from orthoswarm.mosaic.extent import solved_level
     from orthoswarm.refine.registration.map_offset import measure_map_offset
-    from orthoswarm.report.change_section import put_section
-    from orthoswarm.report.page import write_page
+    from orthoswarm.report.page import put_section, write_page
     from orthoswarm.report.trust import headline
 
     out = task.workspace
@@ -153,8 +152,7 @@ def _trust(task: ExportTask, layer: str, refined: list[SolutionFile], moved_m: f
 
     moved_m: by how much stated heights are higher than solved ones.
     """
-    from orthoswarm.export.ground_file import GROUND, write_ground
-    from orthoswarm.export.value_raster import write_confidence
+    from orthoswarm.export.value_raster import GROUND, write_confidence, write_ground
     from orthoswarm.mosaic.confidence import cell_grid, confidence
     from orthoswarm.mosaic.extent import ground_of_nearest
     from orthoswarm.mosaic.visible_ground import nearest_cameras

@@ -23,8 +23,7 @@ from orthoswarm.model.geo import LocalGrid
 from orthoswarm.mosaic.footprint import footprint
 
 _TITLES = {"realtime.tif": "Real-time picture", "coarse.tif": "Coarse orthoimage", "orthoimage.tif": "Orthoimage"}
-_LEAST_M = 0.1
-"""Half the width of an outline that would have none."""
+_LEAST_M = 0.1  # half the width of an outline that would have none
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,8 +24,7 @@ _ONE_FILE_PX: Final = 4e9
 """A map of more pixels is written in tiles where the user does not say how: 40 square kilometres at 0.1 m; as one file
 it has some 10 GB, which web servers, object storage and copying by radio handle badly."""
 _TILE_PX: Final = 8192  # side of a tile, a multiple of 512: some 100 MB a file
-FOLDER = "tiles"
-"""Folder of all tiles and of the collection, within the map's."""
+FOLDER = "tiles"  # folder of all tiles and of the collection, within the map's
 COLLECTION = "collection.json"
 VEHICLES = "vehicles"
 Tiles = Literal["auto", "yes", "no"]
@@ -55,8 +54,7 @@ def in_tiles(wanted: Tiles, window: tuple[int, int, int, int]) -> bool:
 def product_file(folder: Path, name: str) -> Path | None:
     """The raster `name` (`orthoimage.tif`) of a map's folder, as one file or as the virtual raster of its tiles.
 
-    Returns:
-        None if the folder holds neither.
+    Returns None if the folder holds neither.
     """
     single, virtual = folder / name, _virtual(folder, name)
     return single if single.exists() else virtual if virtual.exists() else None

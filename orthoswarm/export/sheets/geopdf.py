@@ -28,26 +28,20 @@ _FOOT_MM: Final = 46.0
 _SCALES: Final = tuple(int(m * 10**k) for k in range(2, 6) for m in (1, 1.5, 2, 2.5, 3, 4, 5, 7.5))
 _STEPS_M: Final = tuple(m * 10**k for k in range(5) for m in (1, 2, 5))
 _STEP_MM: Final = 30.0
-_MOST_LINES: Final = 3
-"""Of the statement on accuracy: so many leave room for the scale bar above the page's edge."""
+_MOST_LINES: Final = 3  # of the statement on accuracy: so many leave room for the scale bar above the page's edge
 _INK, _GRID, _MARK = (20, 24, 28), (28, 100, 176), (214, 64, 159)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Frame:
-    """The map's frame on the page.
+    """The map's frame on the page."""
 
-    Attributes:
-        page: width and height of the page in pixels. box: left, top, right, bottom of the frame in pixels.
-        scale: denominator. west, north: grid metres of the frame's upper left corner. metres: of a pixel.
-    """
-
-    page: tuple[int, int]
-    box: tuple[int, int, int, int]
-    scale: int
-    west: float
-    north: float
-    metres: float
+    page: tuple[int, int]  # width and height of the page in pixels
+    box: tuple[int, int, int, int]  # left, top, right, bottom of the frame in pixels
+    scale: int  # denominator
+    west: float  # grid metres of the frame's upper left corner
+    north: float  # grid metres of the frame's upper left corner
+    metres: float  # of a pixel
 
     def pixel(self, east_m: float, north_m: float) -> tuple[float, float]:
         """Column and row on the page."""
@@ -287,8 +281,7 @@ def grid_zone(zone: int, lat_deg: float) -> str:
 def square(zone: int, east_m: float, north_m: float) -> str:
     """The two letters of the square of 100 km.
 
-    Args:
-        zone: of UTM. east_m, north_m: grid metres, on the south with the false northing of 10,000 km.
+    zone: of UTM. east_m, north_m: grid metres, on the south with the false northing of 10,000 km.
     """
     column = _COLUMNS[(zone - 1) % 3][(math.floor(east_m / _SQUARE_M) - 1) % 8]
     return column + _ROWS[(math.floor(north_m / _SQUARE_M) + (0 if zone % 2 else 5)) % 20]

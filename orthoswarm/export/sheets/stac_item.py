@@ -21,8 +21,7 @@ EXTENSIONS: Final = [
 ]
 _COG: Final = "image/tiff; application=geotiff; profile=cloud-optimized"
 _COLOURS: Final = ("red", "green", "blue", "alpha")
-SURFACE: Final = "dsm.tif"
-"""Its name in a pack, whatever the run was asked to write."""
+SURFACE: Final = "dsm.tif"  # its name in a pack, whatever the run was asked to write
 _SURFACE_BANDS: Final = (("height", "m"), ("sigma", "m"), ("pairs", None))
 
 
@@ -143,8 +142,7 @@ def surface_path(folder: Path) -> Path | None:
 def surface_assets(folder: Path, document: Path) -> dict[str, Any]:
     """The asset under its key; empty if the folder holds no surface model.
 
-    Args:
-        folder: of the map. document: the file that names the asset, relatively to itself.
+    folder: of the map. document: the file that names the asset, relatively to itself.
     """
     import rasterio
 
@@ -173,8 +171,7 @@ def surface_assets(folder: Path, document: Path) -> dict[str, Any]:
 
 # -- outlines in GeoJSON (RFC 7946) ------------------------------------------------------------------------------------
 
-_DECIMALS = 8
-"""Of degrees: a millimetre."""
+_DECIMALS = 8  # of degrees: a millimetre
 
 
 def outline(lat_lon: ArrayLike) -> dict[str, Any]:
@@ -209,8 +206,7 @@ def outline(lat_lon: ArrayLike) -> dict[str, Any]:
 def joined_bbox(boxes: Sequence[Sequence[float]]) -> list[float]:
     """The bbox of all of them, west > east where it lies on the meridian of 180 degrees.
 
-    Args:
-        boxes: at least one, each west, south, east, north in degrees, all within 180 degrees of the first one.
+    boxes: at least one, each west, south, east, north in degrees, all within 180 degrees of the first one.
     """
     west, south, east, north = np.array(boxes, np.float64).T
     east = east + np.where(east < west, 360.0, 0.0)

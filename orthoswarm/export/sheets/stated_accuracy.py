@@ -13,18 +13,13 @@ from orthoswarm.export.product_files import read_frames
 
 @dataclass(frozen=True, slots=True)
 class StatedAccuracy:
-    """The accuracy of a map.
+    """The accuracy of a map."""
 
-    Attributes:
-        sentence: for people. values: for programs, lengths in metres.
-    """
-
-    sentence: str
-    values: dict[str, float | int | str]
+    sentence: str  # for people
+    values: dict[str, float | int | str]  # for programs, lengths in metres
 
 
-_LAYERS = ("orthoimage", "coarse", "realtime")
-"""From the last stage to the first."""
+_LAYERS = ("orthoimage", "coarse", "realtime")  # from the last stage to the first
 
 
 def stated_accuracy(folder: Path, layer: str = "") -> StatedAccuracy | None:

@@ -21,12 +21,10 @@ from orthoswarm.export.tactical.places import Place, utc_text
 from orthoswarm.export.xml_elements import element, xml_bytes
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
-_TYPES: Final = {"vehicle": "a-f-A-M-H-Q", "find": "b-m-p-s-m"}
-"""Friendly unmanned rotary wing; spot map marker."""
+_TYPES: Final = {"vehicle": "a-f-A-M-H-Q", "find": "b-m-p-s-m"}  # friendly unmanned rotary wing; spot map marker
 _UNKNOWN: Final = "9999999.0"
 _STALE_S: Final = {"vehicle": 30.0, "find": 7 * 86_400.0}
-_MAGENTA: Final = "-65281"
-"""ARGB of a find's marker as a signed 32-bit integer."""
+_MAGENTA: Final = "-65281"  # ARGB of a find's marker as a signed 32-bit integer
 _HOPS: Final = 1
 _WAIT_S: Final = 5.0
 
@@ -87,26 +85,17 @@ def write_data_package(places: Iterable[Place], path: Path, name: str = "OrthoSw
 
 @dataclass(frozen=True, slots=True)
 class TakAddress:
-    """Where events go.
+    """Where events go."""
 
-    Attributes:
-        kind: `udp` (one datagram an event), `tcp` or `tls` (a stream of events). host, port: the receiver's.
-        certificate: PEM file with the client's certificate and key, for `tls`. authority: PEM file of the server's CA.
-    """
-
-    kind: str
-    host: str
-    port: int
-    certificate: Path | None = None
-    authority: Path | None = None
+    kind: str  # `udp` (one datagram an event), `tcp` or `tls` (a stream of events)
+    host: str  # the receiver's
+    port: int  # the receiver's
+    certificate: Path | None = None  # PEM file with the client's certificate and key, for `tls`
+    authority: Path | None = None  # PEM file of the server's CA
 
     @classmethod
     def parse(cls, text: str, certificate: Path | None = None, authority: Path | None = None) -> "TakAddress":
-        """From `udp://HOST:PORT`, `tcp://HOST:PORT` or `tls://HOST:PORT`.
-
-        Raises:
-            InputError: it is none of these.
-        """
+        """From `udp://HOST:PORT`, `tcp://HOST:PORT` or `tls://HOST:PORT`. Raises InputError: it is none of these."""
         try:
             parts = urlsplit(text)
             host, port = parts.hostname, parts.port
@@ -120,22 +109,14 @@ class TakAddress:
 
 
 class TakSender:
-    """Sends events to one receiver; a broken connection is opened again with the next event.
-
-    Args:
-        address: the receiver.
-    """
+    """Sends events to one receiver; a broken connection is opened again with the next event. address: the receiver."""
 
     def __init__(self, address: TakAddress) -> None:
         self._address = address
         self._socket: socket.socket | None = None
 
     def send(self, event: bytes) -> None:
-        """Send one event.
-
-        Raises:
-            OrthoSwarmError: the receiver cannot be reached.
-        """
+        """Send one event. Raises OrthoSwarmError: the receiver cannot be reached."""
         to = self._address
         try:
             if self._socket is None:

@@ -29,29 +29,20 @@ _FORMULA: Final = ("=", "+", "-", "@", "\t", "\r")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Place:
-    """A find or a vehicle.
+    """A find or a vehicle."""
 
-    Attributes:
-        uid: unique and lasting. kind: what it is. name: for people.
-        lat_deg, lon_deg: WGS 84. height_m: above the WGS 84 ellipsoid, None if unknown.
-        sigma_m: standard deviation of each horizontal coordinate, None if unknown.
-        time_s: when it was there, UTC epoch seconds. note: more, in words.
-        course_deg: from true north, None if unknown. speed_m_s: over ground.
-        pictures: names of pictures that show it.
-    """
-
-    uid: str
-    kind: Literal["find", "vehicle"]
-    name: str
-    lat_deg: float
-    lon_deg: float
-    time_s: float
-    height_m: float | None = None
-    sigma_m: float | None = None
-    note: str = ""
-    course_deg: float | None = None
-    speed_m_s: float | None = None
-    pictures: tuple[str, ...] = ()
+    uid: str  # unique and lasting
+    kind: Literal["find", "vehicle"]  # what it is
+    name: str  # for people
+    lat_deg: float  # WGS 84
+    lon_deg: float  # WGS 84
+    time_s: float  # when it was there, UTC epoch seconds
+    height_m: float | None = None  # above the WGS 84 ellipsoid, None if unknown
+    sigma_m: float | None = None  # standard deviation of each horizontal coordinate, None if unknown
+    note: str = ""  # more, in words
+    course_deg: float | None = None  # from true north, None if unknown
+    speed_m_s: float | None = None  # over ground
+    pictures: tuple[str, ...] = ()  # names of pictures that show it
 
     @property
     def time(self) -> str:
@@ -79,11 +70,7 @@ def feature(place: Place) -> dict[str, Any]:
 
 
 def write_geojson(places: Iterable[Place], path: Path) -> None:
-    """Write places as GeoJSON.
-
-    Raises:
-        OrthoSwarmError: the disk is full.
-    """
+    """Write places as GeoJSON. Raises OrthoSwarmError: the disk is full."""
     document = {"type": "FeatureCollection", "features": [feature(place) for place in places]}
     write_file(path, json.dumps(document, ensure_ascii=False, indent=1) + "\n")
 
@@ -91,8 +78,7 @@ def write_geojson(places: Iterable[Place], path: Path) -> None:
 def read_places(folder: Path) -> list[Place]:
     """The places that `write_geojson` kept in a map's folder; none if it has no such file.
 
-    Raises:
-        InputError: the file was changed to something else.
+    Raises InputError: the file was changed to something else.
     """
     path = folder / FILE
     if not path.exists():
@@ -132,23 +118,18 @@ def _place(row: Mapping[str, Any]) -> Place:
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """A picture that shows a place.
+    """A picture that shows a place."""
 
-    Attributes:
-        placed: the picture. column, row: where in it, pixels. off_centre: distance from its middle in half diagonals.
-    """
-
-    placed: PlacedFrame
-    column: float
-    row: float
-    off_centre: float
+    placed: PlacedFrame  # the picture
+    column: float  # where in it, pixels
+    row: float  # where in it, pixels
+    off_centre: float  # distance from its middle in half diagonals
 
 
 def sightings(placed: Iterable[PlacedFrame], point: ArrayLike) -> list[Sighting]:
     """The pictures that show a point, those that have it nearest to their middle first.
 
-    Args:
-        placed: pictures with their cameras. point: (3,) east, north and height in the cameras' grid, metres.
+    placed: pictures with their cameras. point: (3,) east, north and height in the cameras' grid, metres.
     """
     found = []
     at = np.asarray(point, dtype=np.float64)
@@ -168,8 +149,7 @@ def sightings(placed: Iterable[PlacedFrame], point: ArrayLike) -> list[Sighting]
 def write_csv(places: Iterable[Place], path: Path) -> None:
     """Write a row a place. Texts that a spreadsheet would take for a formula get an apostrophe before them.
 
-    Raises:
-        OrthoSwarmError: the disk is full.
+    Raises OrthoSwarmError: the disk is full.
     """
     out = io.StringIO(newline="")
     rows = csv.writer(out)
@@ -188,11 +168,7 @@ def spreadsheet_cell(value: object) -> object:
 
 
 def write_gpx(places: Iterable[Place], path: Path) -> None:
-    """Write places as waypoints of GPX 1.1 (topografix.com/GPX/1/1).
-
-    Raises:
-        OrthoSwarmError: the disk is full.
-    """
+    """Write places as waypoints of GPX 1.1 (topografix.com/GPX/1/1). Raises OrthoSwarmError: the disk is full."""
     points = [
         element(
             "wpt",
@@ -214,8 +190,7 @@ def write_kml(places: Iterable[Place], path: Path) -> None:
     Descriptions and balloons are HTML, in which Google Earth would run what a note holds; so texts are escaped as such.
     A name is plain text, but the usual balloon repeats it as HTML: each place has its own.
 
-    Raises:
-        OrthoSwarmError: the disk is full.
+    Raises OrthoSwarmError: the disk is full.
     """
     marks = []
     for place in places:

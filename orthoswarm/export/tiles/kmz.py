@@ -19,11 +19,9 @@ from orthoswarm.export.tiles.tile_pyramid import SIDE, Pyramid, Quad, degrees_of
 from orthoswarm.export.xml_elements import element, kml_bytes, texts
 from orthoswarm.model.arrays import Bytes
 
-Box = tuple[float, float, float, float]
-"""West, south, east, north in degrees."""
+Box = tuple[float, float, float, float]  # west, south, east, north in degrees
 _SINGLE_PX = 2048
-_TOP_NODES = 4
-"""A map that lies across a tile's border has no node of its own size; so up to four are at the top."""
+_TOP_NODES = 4  # A map that lies across a tile's border has no node of its own size; so up to four are at the top
 
 
 def write_kmz(
@@ -32,9 +30,7 @@ def write_kmz(
     """Write a georeferenced RGBA raster as KMZ.
 
     Args:
-        source: the raster, an orthoimage.
-        path: the file; appears when it is complete.
-        name: shown by viewers.
+        source: the raster, an orthoimage. path: the file; appears when it is complete. name: shown by viewers.
         progress: called with parts done and parts in all.
 
     Raises:

@@ -40,12 +40,9 @@ def write_mbtiles(
     """Write a georeferenced RGBA raster as MBTiles 1.3.
 
     Args:
-        source: the raster, an orthoimage.
-        path: the file; appears when it is complete.
-        name: shown by viewers.
+        source: the raster, an orthoimage. path: the file; appears when it is complete. name: shown by viewers.
         tile_format: "png" is read by all programs, "webp" is a third of its size, "jpg" has no transparency.
-        quality: of webp and jpg.
-        progress: called with parts done and parts in all.
+        quality: of webp and jpg. progress: called with parts done and parts in all.
 
     Raises:
         InputError: if the raster cannot be read.

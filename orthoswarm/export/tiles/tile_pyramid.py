@@ -32,11 +32,7 @@ class ReducedRaster(contextlib.ExitStack):
     The overviews of our orthoimages are means of 2 x 2 pixels, so that nothing is lost against reading all pixels; they
     are opened when they are first asked for. Not for several threads at once.
 
-    Args:
-        path: the raster.
-
-    Raises:
-        RasterioError: it cannot be read.
+    path: the raster. Raises RasterioError: it cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -51,8 +47,7 @@ class ReducedRaster(contextlib.ExitStack):
     def at(self, factor: float) -> tuple[Any, float]:
         """The dataset whose pixels are the largest that are at most `factor` pixels of the raster wide.
 
-        Returns:
-            The dataset, and how many of its pixels `factor` is.
+        Returns the dataset, and how many of its pixels `factor` is.
         """
         import rasterio
 
@@ -67,13 +62,11 @@ class ReducedRaster(contextlib.ExitStack):
 
 Tell = Callable[[int, int], None]
 SIDE: Final = 256
-_STEP: Final = 32
-"""Pixels between exactly transformed points: a tile bends by less than 1e-4 of a pixel between them."""
+_STEP: Final = 32  # pixels between exactly transformed points: a tile bends by less than 1e-4 of a pixel between them
 _BLOCK_ZOOMS: Final = 3
 _DEEPEST: Final = 23
 _ENCODERS: Final = 2
-_AHEAD: Final = 32
-"""Quads of 1 MB that wait to be encoded."""
+_AHEAD: Final = 32  # quads of 1 MB that wait to be encoded
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,15 +99,12 @@ class TileRange:
 
 @dataclass(frozen=True, slots=True)
 class Pyramid:
-    """The tiles of an orthoimage.
+    """The tiles of an orthoimage."""
 
-    Attributes:
-        bounds: west, south, east, north of the orthoimage in degrees; east is beyond 180 where the map lies on that
-            meridian, and columns are beyond the last one there.
-        levels: from the finest zoom to the one where a single tile holds all, or zoom 1 with a tile on either side.
-    """
-
+    # west, south, east, north of the orthoimage in degrees; east is beyond 180 where the map lies on that meridian, and
+    # columns are beyond the last one there
     bounds: tuple[float, float, float, float]
+    # from the finest zoom to the one where a single tile holds all, or zoom 1 with a tile on either side
     levels: tuple[TileRange, ...]
 
     @property
@@ -156,18 +146,13 @@ class Pyramid:
 
 @dataclass(frozen=True, slots=True)
 class Quad:
-    """Four tiles, those that the tile `zoom`, `x`, `y` is made of.
+    """Four tiles, those that the tile `zoom`, `x`, `y` is made of."""
 
-    Attributes:
-        zoom: of the parent; -1 for the one tile of zoom 0. x, y: column, and row from the north, of the parent; the
-            column as `Pyramid` counts.
-        rgba: uint8 (512, 512, 4), something drawn.
-    """
-
-    zoom: int
+    zoom: int  # of the parent; -1 for the one tile of zoom 0
+    # x, y: column, and row from the north, of the parent; the column as `Pyramid` counts
     x: int
     y: int
-    rgba: Bytes
+    rgba: Bytes  # uint8 (512, 512, 4), something drawn
 
     def tiles(self) -> Iterator[tuple[int, int, Bytes]]:
         """Column, row from the north and pixels, uint8 (256, 256, 4), of its tiles where something is drawn.
@@ -348,8 +333,7 @@ class _Drawing:
 # -- drawing ------------------------------------------------------------------------------------------------------
 
 _LEAST_WEIGHT: Final = 1e-5
-_FAR: Final = -1e9
-"""A place outside every raster, for points that the source's system does not have."""
+_FAR: Final = -1e9  # A place outside every raster, for points that the source's system does not have
 
 
 def _warp(raster: Any, nodes: Array, step: int) -> Bytes | None:

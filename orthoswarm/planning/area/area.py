@@ -23,19 +23,12 @@ a map have fewer, and 4,000 cost no second)."""
 
 @dataclass(frozen=True)
 class Area:
-    """Ground to be mapped and zones that no path may cross.
+    """Ground to be mapped and zones that no path may cross."""
 
-    Attributes:
-        grid: UTM grid of the area.
-        ground: shapely (Multi)Polygon in grid metres, no-fly zones taken out.
-        no_fly: shapely (Multi)Polygon in grid metres, perhaps empty: the polygons' holes and further zones.
-        circles_wider_m: so much outside a circle that its polygon in `no_fly` is drawn around lies that.
-    """
-
-    grid: LocalGrid
-    ground: Geometry
-    no_fly: Geometry
-    circles_wider_m: float = 0.0
+    grid: LocalGrid  # UTM grid of the area
+    ground: Geometry  # shapely (Multi)Polygon in grid metres, no-fly zones taken out
+    no_fly: Geometry  # shapely (Multi)Polygon in grid metres, perhaps empty: the polygons' holes and further zones
+    circles_wider_m: float = 0.0  # so much outside a circle that its polygon in `no_fly` is drawn around lies that
 
     @property
     def size_m2(self) -> float:
@@ -104,8 +97,7 @@ def _in_grid(shapes: Sequence[Polygon], grid: LocalGrid) -> list[Geometry]:
 def _refuse_inside(outlines: Sequence[Geometry], forbidden: Geometry) -> None:
     """Refuse an outline of which no-fly zones leave nothing; each is compared with the zones near it only.
 
-    Raises:
-        InputError: there is such an outline.
+    Raises InputError: there is such an outline.
     """
     zones = shapely.get_parts(forbidden)  # which do not overlap
     outline, zone = shapely.STRtree(zones).query(outlines, predicate="intersects")
@@ -120,8 +112,7 @@ def _refuse_inside(outlines: Sequence[Geometry], forbidden: Geometry) -> None:
 def _check(polygon: Geometry, shell: Ring, grid: LocalGrid, name: str) -> None:
     """Refuse a polygon in grid metres that is none; `shell` is its outline in degrees.
 
-    Raises:
-        InputError: it says what is wrong.
+    Raises InputError: it says what is wrong.
     """
     if not np.isfinite(shapely.get_coordinates(polygon)).all():
         raise InputError(f"{name} reaches too far for one UTM grid; plan a smaller area")

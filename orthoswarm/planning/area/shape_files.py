@@ -43,15 +43,10 @@ _UNIT_NAMES: Final = ("unit", "units", "uom", "uomdimensions", "radius_unit", "r
 
 @dataclass(frozen=True, slots=True)
 class Polygon:
-    """A polygon on the globe.
+    """A polygon on the globe."""
 
-    Attributes:
-        shell: outer ring, float64 (n, 2), latitude and longitude in degrees, not closed.
-        holes: inner rings of the same form.
-    """
-
-    shell: Ring
-    holes: tuple[Ring, ...] = ()
+    shell: Ring  # outer ring, float64 (n, 2), latitude and longitude in degrees, not closed
+    holes: tuple[Ring, ...] = ()  # inner rings of the same form
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,21 +66,13 @@ class Circle:
 
 @dataclass(frozen=True, slots=True)
 class Shapes:
-    """What a file holds.
+    """What a file holds."""
 
-    Attributes:
-        polygons: its polygons, strips of lines with a width among them.
-        lines: its polylines, each float64 (n, 2), latitude and longitude in degrees.
-        circles: its circles.
-        hidden: polygons that are switched off in the file (KML's visibility).
-        unused: what else it holds, in words ("2 points").
-    """
-
-    polygons: tuple[Polygon, ...] = ()
-    lines: tuple[Ring, ...] = ()
-    circles: tuple[Circle, ...] = ()
-    hidden: tuple[Polygon, ...] = ()
-    unused: tuple[str, ...] = ()
+    polygons: tuple[Polygon, ...] = ()  # its polygons, strips of lines with a width among them
+    lines: tuple[Ring, ...] = ()  # its polylines, each float64 (n, 2), latitude and longitude in degrees
+    circles: tuple[Circle, ...] = ()  # its circles
+    hidden: tuple[Polygon, ...] = ()  # polygons that are switched off in the file (KML's visibility)
+    unused: tuple[str, ...] = ()  # what else it holds, in words ("2 points")
 
     @property
     def areas(self) -> tuple[Polygon, ...]:
@@ -108,8 +95,7 @@ def ring(points: Any, name: str, least: int = 3) -> Ring:
     """A ring or line of (latitude, longitude) degrees, checked; closing and repeated points dropped.
 
     Args:
-        points: array-like (n, 2).
-        name: how to call the source in an error.
+        points: array-like (n, 2). name: how to call the source in an error.
         least: points that must remain: 3 for a ring (which then is not closed), 2 for a line.
 
     Raises:
@@ -217,8 +203,7 @@ def counted(nouns: Mapping[str, int]) -> tuple[str, ...]:
 def circle_of(lat: float, lon: float, said: Mapping[str, Any], name: str) -> Circle | None:
     """The circle around a point, by its properties (names in lower case); None if they state no radius.
 
-    Raises:
-        InputError: none that a zone can have, or in an unknown unit.
+    Raises InputError: none that a zone can have, or in an unknown unit.
     """
     radius = said.get("radius_m", said.get("radius"))
     if radius is None:
@@ -230,8 +215,7 @@ def circle_of(lat: float, lon: float, said: Mapping[str, Any], name: str) -> Cir
 def strip_of(line: Ring, said: Mapping[str, Any], name: str) -> list[Polygon]:
     """The ground within half a width of a line, by its properties; nothing if they state no width.
 
-    Raises:
-        InputError: none that a zone can have, or in an unknown unit.
+    Raises InputError: none that a zone can have, or in an unknown unit.
     """
     if said.get("width_m") is None:
         return []
@@ -292,8 +276,7 @@ def _lat_lon(positions: Sequence[Sequence[float]]) -> list[tuple[float, float]]:
 def parse_kml(text: str | bytes, name: str = "the KML file", *, any_size: bool = False) -> Shapes:
     """Polygons and lines of a KML text (OGC KML 2.x; any namespace); any_size: see `parse_geojson`.
 
-    Raises:
-        InputError: no XML, no KML, or coordinates that are not longitude and latitude.
+    Raises InputError: no XML, no KML, or coordinates that are not longitude and latitude.
     """
     try:
         root = ElementTree.fromstring(_mended(text))

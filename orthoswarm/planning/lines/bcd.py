@@ -6,7 +6,6 @@ that every line crosses in one piece. Cells are then flown in an order, and ente
 between them.
 """
 
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -34,8 +33,7 @@ _ROW_ROUNDS: Final = (20, 2)  # ... in so many rounds at most, with more cells i
 def cells(ground: Geometry) -> list[Geometry]:
     """Cells of a polygon for a sweep along +x (lines along y): shapely polygons that together are the ground.
 
-    Args:
-        ground: shapely (Multi)Polygon, metres.
+    ground: shapely (Multi)Polygon, metres.
     """
     tilt = Turned(_HAIR_RAD, (0.0, 0.0))
     found = []
@@ -44,7 +42,8 @@ def cells(ground: Geometry) -> list[Geometry]:
         cuts = [_cut(polygon, corner) for corner in critical_points(polygon)]
         lines = shapely.union_all([polygon.boundary, *[c for c in cuts if c is not None]], grid_size=_SNAP_M)
         for cell in shapely.get_parts(shapely.polygonize(shapely.get_parts(lines))):
-            if shapely.contains_xy(polygon, *_point_in(cell)):
+            point = shapely.point_on_surface(cell)
+            if shapely.contains_xy(polygon, *(point.x, point.y)):
                 found.append(shapely.transform(cell, tilt.to_grid))
     return found
 
@@ -63,11 +62,6 @@ def critical_points(polygon: Geometry) -> Array:
     return np.concatenate(found)
 
 
-def _point_in(cell: Geometry) -> tuple[float, float]:
-    point = shapely.point_on_surface(cell)
-    return point.x, point.y
-
-
 def _cut(polygon: Geometry, corner: Array) -> Geometry:
     """The line through a critical point, up and down to the next wall."""
     _, low, _, high = polygon.bounds
@@ -81,34 +75,25 @@ def _cut(polygon: Geometry, corner: Array) -> Geometry:
     return shapely.LineString([(corner[0], bottom - _INTO_M), (corner[0], top + _INTO_M)])
 
 
-@dataclass(frozen=True)
-class _Sweep:
-    """The lines of one cell.
+def _variants(lines: list[Array]) -> list[Array]:
+    """Four ways to fly a cell: beginning at the first or the last line, upwards or downwards.
 
-    Attributes:
-        lines: per line, its legs from low to high y, float64 (k, 2, 2).
+    lines: for each its legs from low to high y, float64 (k, 2, 2).
     """
-
-    lines: list[Array]
-
-    def variants(self) -> list[Array]:
-        """Four ways to fly the cell: beginning at the first or the last line, upwards or downwards."""
-        result = []
-        for lines in (self.lines, self.lines[::-1]):
-            for up in (True, False):
-                legs = [line if up == (k % 2 == 0) else line[::-1, ::-1] for k, line in enumerate(lines)]
-                result.append(np.concatenate(legs))
-        return result
+    result = []
+    for row in (lines, lines[::-1]):
+        for up in (True, False):
+            legs = [line if up == (k % 2 == 0) else line[::-1, ::-1] for k, line in enumerate(row)]
+            result.append(np.concatenate(legs))
+    return result
 
 
 def bcd_legs(field: Field, angle_rad: float, foot: Footprint, router: Router, multiple: int = 1) -> Array:
     """Legs of all cells in flying order.
 
     Args:
-        field: ground and obstacles, grid metres.
-        angle_rad: direction of the sweep, from grid east, counter-clockwise.
-        foot: footprint of the narrowest camera.
-        router: measures the ways between cells.
+        field: ground and obstacles, grid metres. angle_rad: direction of the sweep, from grid east, counter-clockwise.
+        foot: footprint of the narrowest camera. router: measures the ways between cells.
         multiple: make the number of lines a multiple of this, by laying them closer.
 
     Returns:
@@ -118,13 +103,10 @@ def bcd_legs(field: Field, angle_rad: float, foot: Footprint, router: Router, mu
     local = field.turned(frame)
     # A ragged coast has a critical point at every tooth, so cells are cut from a smoothed outline.
     parts = cells(local.ground.simplify(_TOOTH_SPACINGS * foot.spacing_m))
-    sweeps = [
-        _Sweep([frame.to_grid(np.array(line)) for line in lines])
-        for lines in _by_cell(lines_across(local, foot, multiple), parts)
-    ]
-    if not sweeps:
+    by_cell = _by_cell(lines_across(local, foot, multiple), parts)
+    if not by_cell:
         return np.empty((0, 2, 2))
-    variants = [sweep.variants() for sweep in sweeps]
+    variants = [_variants([frame.to_grid(np.array(line)) for line in lines]) for lines in by_cell]
     entry = np.array([[v[0, 0] for v in cell] for cell in variants]).reshape(-1, 2)
     exit_ = np.array([[v[-1, 1] for v in cell] for cell in variants]).reshape(-1, 2)
     ways = np.minimum(router.distances(exit_, entry), 1e9)
@@ -155,8 +137,7 @@ def order_cells(ways: Array) -> list[int]:
     Few cells are ordered exactly (Held and Karp 1962). Of many: nearest neighbours from every cell, the best row
     improved by moving cells; which of its four ways each cell is flown follows exactly, by dynamic programming over it.
 
-    Args:
-        ways: float64 (4 n, 4 n), from exit of cell and way to entry of cell and way, metres.
+    ways: float64 (4 n, 4 n), from exit of cell and way to entry of cell and way, metres.
     """
     n = len(ways) // 4
     if n == 1:

@@ -125,8 +125,7 @@ def maximum_matching(
 
     Args:
         start: int64 (lefts + 1,), where each left vertex's neighbours begin in `links`.
-        links: int64, right neighbours, row by row.
-        rights: number of right vertices.
+        links: int64, right neighbours, row by row. rights: number of right vertices.
     """
     mate_left, mate_right = _hopcroft_karp(start, links, rights)
     return mate_left, mate_right

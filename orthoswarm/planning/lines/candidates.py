@@ -29,15 +29,10 @@ _HOPELESS: Final = 1.08  # gaps are not filled for a direction whose path is so 
 
 @dataclass(frozen=True)
 class LineCandidate:
-    """One way to lay lines.
+    """One way to lay lines."""
 
-    Attributes:
-        legs: float64 (n, 2, 2) in flying order, grid metres, gaps mended.
-        stretches: among how many vehicles the legs, without those that mend gaps, can be shared.
-    """
-
-    legs: Array
-    stretches: int
+    legs: Array  # float64 (n, 2, 2) in flying order, grid metres, gaps mended
+    stretches: int  # among how many vehicles the legs, without those that mend gaps, can be shared
 
     def then(self, other: "LineCandidate") -> "LineCandidate":
         """The lines of this one, and then those of another, from the end that is nearer."""
@@ -64,10 +59,8 @@ def candidates(
     Args:
         field: ground and obstacles, grid metres.
         vehicles: where few lines are shared by many vehicles, a multiple of them shares out more evenly.
-        foot: footprint of the narrowest camera.
-        method: how to lay and order lines.
-        turn_m: what a turn costs, in metres.
-        router: measures ways around obstacles.
+        foot: footprint of the narrowest camera. method: how to lay and order lines.
+        turn_m: what a turn costs, in metres. router: measures ways around obstacles.
         reach_m: how far pictures count beyond a leg's ends when looking for gaps.
         sweep_rad: direction of the sweep, across the lines, from grid east, counter-clockwise; None to try several.
         cross: each is followed by lines across its own.
@@ -89,9 +82,11 @@ def candidates(
         legs = _lay(field, angle, foot, method=method, router=router, multiple=1)
         if not len(legs):
             continue
-        count = stretches(np.hypot(*(legs[:, 1] - legs[:, 0]).T), foot.spacing_m)
+        lengths = np.hypot(*(legs[:, 1] - legs[:, 0]).T)
+        count = stretches(lengths, foot.spacing_m)
         few = few or count < 4 * vehicles
-        rough = _rough_cost(legs, turn_m)
+        ways = np.hypot(*(legs[1:, 0] - legs[:-1, 1]).T).sum()  # no-fly zones between legs left out
+        rough = float(lengths.sum() + ways + turn_m * len(legs))
         least = min(least, rough)
         if not few and rough > _HOPELESS * least:
             continue
@@ -104,12 +99,6 @@ def candidates(
                 yield from _finished(
                     field, denser, count, angle=angle, foot=foot, method=method, router=router, reach_m=reach_m
                 )
-
-
-def _rough_cost(legs: Array, turn_m: float) -> float:
-    """Metres to fly a row of legs, turns counted as metres, no-fly zones between legs left out."""
-    ways = np.hypot(*(legs[1:, 0] - legs[:-1, 1]).T).sum()
-    return float(np.hypot(*(legs[:, 1] - legs[:, 0]).T).sum() + ways + turn_m * len(legs))
 
 
 def _lay(field: Field, angle: float, foot: Footprint, *, method: Method, router: Router, multiple: int) -> Array:
@@ -156,8 +145,7 @@ def _finished(
 def chained(loops: list[Array]) -> Array:
     """Closed rows of legs one after the other: the first opened at its widest gap, others near the one before.
 
-    Args:
-        loops: float64 (n, 2, 2) each.
+    loops: float64 (n, 2, 2) each.
     """
     if not loops:
         return np.empty((0, 2, 2))

@@ -91,7 +91,12 @@ class Router:
         self._edges = np.concatenate([np.hstack([r[:-1], r[1:]]) for r in rings]) if rings else np.empty((0, 4))
         shapely.prepare(shrunk)
         self._shrunk = shrunk
-        self._corners = _convex_corners(obstacles)
+        found = [np.empty((0, 2))]
+        for polygon in shapely.get_parts(obstacles):
+            ring = shapely.get_coordinates(shapely.geometry.polygon.orient(polygon).exterior)[:-1]
+            before, after = ring - np.roll(ring, 1, axis=0), np.roll(ring, -1, axis=0) - ring
+            found.append(ring[before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0] > 0])
+        self._corners = np.concatenate(found)
         self._hops: Array = np.empty((0, 0))
         self._before: Ints = np.empty((0, 0), np.int32)
         if len(self._corners):
@@ -148,8 +153,7 @@ class Router:
     def path(self, start: ArrayLike, end: ArrayLike) -> Array:
         """The shortest free path, float64 (k, 2) with both ends.
 
-        Raises:
-            InputError: there is none (one end lies in an obstacle).
+        Raises InputError: there is none (one end lies in an obstacle).
         """
         p, q = np.asarray(start, np.float64).reshape(1, 2), np.asarray(end, np.float64).reshape(1, 2)
         if not self.blocked(p, q)[0]:
@@ -163,13 +167,3 @@ class Router:
         while corners[-1] != i:
             corners.append(int(self._before[i, corners[-1]]))
         return np.concatenate([p, self._corners[corners[::-1]], q])
-
-
-def _convex_corners(obstacles: Geometry) -> Array:
-    """Corners (n, 2) of polygons at which a shortest path may bend."""
-    found = [np.empty((0, 2))]
-    for polygon in shapely.get_parts(obstacles):
-        ring = shapely.get_coordinates(shapely.geometry.polygon.orient(polygon).exterior)[:-1]
-        before, after = ring - np.roll(ring, 1, axis=0), np.roll(ring, -1, axis=0) - ring
-        found.append(ring[before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0] > 0])
-    return np.concatenate(found)

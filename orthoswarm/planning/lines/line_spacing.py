@@ -11,20 +11,13 @@ HIGHEST_M = 10_000.0
 
 @dataclass(frozen=True, slots=True)
 class Footprint:
-    """Ground covered by one picture of the narrowest camera, straight down, its width across the leg.
+    """Ground covered by one picture of the narrowest camera, straight down, its width across the leg."""
 
-    Attributes:
-        width_m: across the leg, 2 h tan(FoV / 2).
-        height_m: along the leg, width over the aspect ratio.
-        spacing_m: largest distance between neighbouring lines, width (1 - side overlap).
-        trigger_m: distance between pictures on a leg, height (1 - forward overlap).
-        slant_m: how much less far pictures see along the leg at its strip's edge, as they are turned against it.
-    """
-
-    width_m: float
-    height_m: float
-    spacing_m: float
-    trigger_m: float
+    width_m: float  # across the leg, 2 h tan(FoV / 2)
+    height_m: float  # along the leg, width over the aspect ratio
+    spacing_m: float  # largest distance between neighbouring lines, width (1 - side overlap)
+    trigger_m: float  # distance between pictures on a leg, height (1 - forward overlap)
+    # how much less far pictures see along the leg at its strip's edge, as they are turned against it
     slant_m: float = 0.0
 
     @property
@@ -61,10 +54,8 @@ def footprint(
     """The footprint of theta-hat, the field of view below the smallest that any camera of the swarm has (paper III.A).
 
     Args:
-        altitude_m: height of the legs above ground, metres.
-        fov_min_rad: theta-hat, horizontal, radians.
-        aspect: picture's width over its height.
-        side: overlap of neighbouring lines' pictures, 0 to 0.95.
+        altitude_m: height of the legs above ground, metres. fov_min_rad: theta-hat, horizontal, radians.
+        aspect: picture's width over its height. side: overlap of neighbouring lines' pictures, 0 to 0.95.
         forward: overlap of consecutive pictures, 0 to 0.95.
 
     Raises:

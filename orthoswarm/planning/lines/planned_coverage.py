@@ -26,10 +26,7 @@ _GAP_LEG_PRICE: Final = 0.02  # price of a line spacing of flight, in shares of 
 def bands(legs: Array, width_m: float, reach_m: float) -> Geometry:
     """The ground seen from each leg: an array of n shapely rectangles.
 
-    Args:
-        legs: float64 (n, 2, 2).
-        width_m: width across the leg.
-        reach_m: how far a band goes on beyond the leg's ends.
+    legs: float64 (n, 2, 2). width_m: width across the leg. reach_m: how far a band goes on beyond the leg's ends.
     """
     step = legs[:, 1] - legs[:, 0]
     along = step / np.maximum(np.hypot(*step.T), 1e-9)[:, None]
@@ -73,10 +70,8 @@ def mend(field: Field, legs: Array, foot: Footprint, *, router: Router, reach_m:
     Gaps arise beside obstacles with slanted walls, where a line must stop although its band's edge could go on.
 
     Args:
-        field: ground and obstacles, grid metres.
-        legs: float64 (n, 2, 2) in flying order.
-        foot: footprint of the narrowest camera.
-        router: measures detours.
+        field: ground and obstacles, grid metres. legs: float64 (n, 2, 2) in flying order.
+        foot: footprint of the narrowest camera. router: measures detours.
         reach_m: how far pictures count beyond a leg's ends.
         angle_rad: the sweep's direction, one of those tried for further legs.
     """
@@ -151,10 +146,8 @@ def insert(legs: Array, ways: Array, leg: Array, router: Router) -> tuple[Array,
     """Put a further leg, in its better direction, where the row grows least.
 
     Args:
-        legs: float64 (n, 2, 2) in flying order, at least one.
-        ways: float64 (n - 1,), lengths of the ways between them.
-        leg: float64 (2, 2).
-        router: measures ways around obstacles.
+        legs: float64 (n, 2, 2) in flying order, at least one. ways: float64 (n - 1,), lengths of the ways between them.
+        leg: float64 (2, 2). router: measures ways around obstacles.
 
     Returns:
         Legs and ways with the new one.

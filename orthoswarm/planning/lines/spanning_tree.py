@@ -23,8 +23,7 @@ def spanning_edges(cells: Cells, x_joins: Cells, y_joins: Cells) -> NDArray[np.u
     """Tree edges of each cell as bits (east 1, north 2, west 4, south 8) of a spanning forest with few turns.
 
     Args:
-        cells: bool (nx, ny).
-        x_joins: bool (nx - 1, ny), joins of bricks along x.
+        cells: bool (nx, ny). x_joins: bool (nx - 1, ny), joins of bricks along x.
         y_joins: bool (nx, ny - 1), joins along y.
     """
     edges = np.zeros(cells.shape, np.uint8)

@@ -32,15 +32,10 @@ _SHORTEST_M: Final = 0.01  # shorter parts of lines are rounding
 
 @dataclass(frozen=True)
 class Turned:
-    """A frame turned against the grid about a point.
+    """A frame turned against the grid about a point."""
 
-    Attributes:
-        angle_rad: counter-clockwise from grid east to the frame's +x axis.
-        centre: grid coordinates of its origin.
-    """
-
-    angle_rad: float
-    centre: tuple[float, float]
+    angle_rad: float  # counter-clockwise from grid east to the frame's +x axis
+    centre: tuple[float, float]  # grid coordinates of its origin
 
     @cached_property
     def _matrix(self) -> Array:
@@ -62,15 +57,10 @@ class Turned:
 
 @dataclass(frozen=True)
 class Field:
-    """Ground and obstacles in one frame.
+    """Ground and obstacles in one frame."""
 
-    Attributes:
-        ground: what is to be covered, shapely, metres.
-        obstacles: what no leg may cross, shapely, metres.
-    """
-
-    ground: Geometry
-    obstacles: Geometry
+    ground: Geometry  # what is to be covered, shapely, metres
+    obstacles: Geometry  # what no leg may cross, shapely, metres
 
     def turned(self, frame: Turned) -> "Field":
         """Ground and obstacles in a turned frame."""
@@ -91,8 +81,7 @@ def strip_legs(field: Field, box: tuple[float, float, float, float], foot: Footp
     Where an obstacle lies on the line, the leg ends before it and another begins behind it.
 
     Args:
-        field: ground and obstacles; lines run along y.
-        box: x0, y0, x1, y1.
+        field: ground and obstacles; lines run along y. box: x0, y0, x1, y1.
         foot: footprint; legs overshoot by what it needs and are at least a trigger distance long where there is room.
         merge_m: gaps between ground shorter than this are flown over with the camera on.
 
@@ -153,11 +142,7 @@ def _at_least(obstacles: Geometry, x: float, ends: tuple[float, float], length: 
 
 
 def line_count(width_m: float, spacing_m: float) -> int:
-    """Lines that a width needs.
-
-    Raises:
-        InputError: far more than any swarm can fly.
-    """
+    """Lines that a width needs. Raises InputError: far more than any swarm can fly."""
     count = max(1, int(np.ceil(width_m / spacing_m - 1e-6)))
     if count > MOST_LINES:
         raise InputError(

@@ -59,15 +59,6 @@ def occupied(ground: Geometry, origin: tuple[float, float], size: tuple[float, f
     return result
 
 
-def _runs(loop: Loop) -> list[Loop]:
-    """The straight runs of a closed path in order, as indices into it; neighbours share their corner."""
-    n = len(loop)
-    steps = np.roll(loop, -1, axis=0) - loop
-    corners = np.flatnonzero((steps != np.roll(steps, 1, axis=0)).any(1))
-    ends = np.append(corners[1:], corners[0] + n)
-    return [np.arange(a, b + 1) % n for a, b in zip(corners, ends)]
-
-
 def _loop_legs(
     loop: Loop,
     filled: Flags,
@@ -78,7 +69,11 @@ def _loop_legs(
     foot: Footprint,
 ) -> list[Array]:
     """Legs of one closed path: each sub-cell with ground is covered by the longest run through it."""
-    runs = _runs(loop)
+    n = len(loop)
+    steps = np.roll(loop, -1, axis=0) - loop
+    corners = np.flatnonzero((steps != np.roll(steps, 1, axis=0)).any(1))
+    ends = np.append(corners[1:], corners[0] + n)
+    runs = [np.arange(a, b + 1) % n for a, b in zip(corners, ends)]
     free = filled[loop[:, 0], loop[:, 1]]
     owned: dict[int, list[Loop]] = {}
     for number in sorted(range(len(runs)), key=lambda r: -int(free[runs[r]].sum())):

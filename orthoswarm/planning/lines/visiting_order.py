@@ -103,8 +103,7 @@ def shorten(legs: Array, router: Router, depot: Array | None = None) -> Array:
     """The same legs in an order, and each in a direction, with shorter ways between them.
 
     Args:
-        legs: float64 (n, 2, 2) in flying order; a good order to begin with.
-        router: measures ways around obstacles.
+        legs: float64 (n, 2, 2) in flying order; a good order to begin with. router: measures ways around obstacles.
         depot: float64 (2,) where the row begins and ends; None leaves both ends open.
 
     Returns:

@@ -48,43 +48,34 @@ _SORTIE_SHORTER_GROWTH: Final = 1.6  # ... times this with each further one
 
 @dataclass(frozen=True, kw_only=True)
 class PlanOptions:
-    """Everything about the flights that has a good default.
+    """Everything about the flights that has a good default."""
 
-    Attributes:
-        motion: speeds of the vehicles, and the times of the slowest autopilot, by which the work is shared.
-        autopilots: the times of each vehicle's autopilot, given in turn; none: those of `motion` for all.
-        end: what a sortie does at last: return to launch, land at home, or hover at the end of its last leg.
-        starts: takeoff points as (latitude, longitude) in degrees: none (each vehicle starts where its first leg
-            begins), one for all, or several that vehicles are given in turn.
-        endurance_s: longest flight on one battery; infinite without a limit.
-        endurances_s: longest flight of each vehicle, where they differ; then `endurance_s` is not used.
-        clearance_m: distance that paths keep from no-fly zones; None keeps a metre, less where pictures are so small
-            that a metre would leave gaps.
-        separation: how far apart vehicles stay.
-        most_items: mission items that the autopilot can hold.
-        run_in_m: straight flight in line with a leg before its first picture, so that the vehicle is out of its turn.
-        wait_s: how long a vehicle stays at the end of its last flight's last leg before it comes home, as far as its
-            endurance allows.
-        heading: of an area's lines, degrees clockwise from true north, along the wind, or along its longest side; None
-            for the directions that are done soonest.
-        cross: cover an area a second time by lines across the first.
-        quickest_s: shortest time between pictures without a warning.
-    """
-
+    # speeds of the vehicles, and the times of the slowest autopilot, by which the work is shared
     motion: Motion = field(default_factory=Motion)
+    # the times of each vehicle's autopilot, given in turn; none: those of `motion` for all
     autopilots: Sequence[AutopilotTimes] = ()
-    end: End = "rtl"
+    end: End = "rtl"  # what a sortie does at last: return to launch, land at home, or hover at the end of its last leg
+    # takeoff points as (latitude, longitude) in degrees: none (each vehicle starts where its first leg begins), one for
+    # all, or several that vehicles are given in turn
     starts: Sequence[tuple[float, float]] = ()
-    endurance_s: float = float("inf")
+    endurance_s: float = float("inf")  # longest flight on one battery; infinite without a limit
+    # longest flight of each vehicle, where they differ; then `endurance_s` is not used
     endurances_s: Sequence[float] = ()
+    # distance that paths keep from no-fly zones; None keeps a metre, less where pictures are so small that a metre
+    # would leave gaps
     clearance_m: float | None = None
-    separation: Separation = field(default_factory=Separation)
-    most_items: int = ARDUPILOT.most_items
+    separation: Separation = field(default_factory=Separation)  # how far apart vehicles stay
+    most_items: int = ARDUPILOT.most_items  # mission items that the autopilot can hold
+    # straight flight in line with a leg before its first picture, so that the vehicle is out of its turn
     run_in_m: float = 0.0
+    # how long a vehicle stays at the end of its last flight's last leg before it comes home, as far as its endurance
+    # allows
     wait_s: float = 0.0
+    # of an area's lines, degrees clockwise from true north, along the wind, or along its longest side; None for the
+    # directions that are done soonest
     heading: Heading | None = None
-    cross: bool = False
-    quickest_s: float = PLANNING.quickest_s
+    cross: bool = False  # cover an area a second time by lines across the first
+    quickest_s: float = PLANNING.quickest_s  # shortest time between pictures without a warning
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "motion", replace(self.motion, lands=self.end == "land"))
@@ -98,8 +89,7 @@ class PlanOptions:
     def check(self) -> None:
         """Refuse values that mean nothing.
 
-        Raises:
-            InputError: a value that is not larger than 0 or out of reach, or a start that is not a position.
+        Raises InputError: a value that is not larger than 0 or out of reach, or a start that is not a position.
         """
         speed = self.motion.speed_m_s
         if not _SLOWEST_M_S <= speed <= _FASTEST_M_S:
@@ -139,19 +129,12 @@ class PlanOptions:
 
 @dataclass(frozen=True)
 class Work:
-    """What each vehicle of a plan flies.
+    """What each vehicle of a plan flies."""
 
-    Attributes:
-        sorties: per vehicle, its sorties' legs, float64 (n, 2, 2) each, in flying order.
-        homes: per vehicle, where it takes off, float64 (2,).
-        longest_s: time in the air of the busiest vehicle.
-        balance: longest over mean path length of the vehicles.
-    """
-
-    sorties: list[list[Array]]
-    homes: list[Array]
-    longest_s: float
-    balance: float
+    sorties: list[list[Array]]  # per vehicle, its sorties' legs, float64 (n, 2, 2) each, in flying order
+    homes: list[Array]  # per vehicle, where it takes off, float64 (2,)
+    longest_s: float  # time in the air of the busiest vehicle
+    balance: float  # longest over mean path length of the vehicles
 
     @property
     def score(self) -> float:
@@ -277,15 +260,9 @@ class Swarm:
     def _flight(self, legs: Array, home: Array, out_m: float, home_m: float, wait_s: float = 0.0) -> Flight:
         run_in = self._options.run_in_m
         flight = make_flight(
-            legs,
-            home,
-            self._heights,
-            router=self._router,
-            returns=self._returns,
-            out_m=out_m,
-            home_m=home_m,
+            legs, home, self._heights, router=self._router, returns=self._returns, out_m=out_m, home_m=home_m,
             run_in_m=run_in,
-        )
+        )  # fmt: skip
         return replace(flight, wait_s=wait_s) if wait_s else flight
 
     @property

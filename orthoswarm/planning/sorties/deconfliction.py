@@ -32,25 +32,17 @@ _LAYER_PRICE_S: Final = 3.0  # price of each further height layer, in seconds of
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Separation:
-    """How far apart vehicles stay.
+    """How far apart vehicles stay."""
 
-    Attributes:
-        distance_m: horizontally, or
-        height_m: vertically, the height of a layer.
-        layers: how many layers there are above the legs' height.
-        slack_s: how much earlier or later than planned a vehicle may be. Around a start that vehicles share, it is
-            what their autopilots need there (`takeoff_slack_s`, `landing_slack_s`), at most this.
-        launch_s: time between takeoffs, and between landings, at one start.
-        swap_s: time on the ground between a vehicle's sorties.
-        in_turn_share: vehicles of one start take off and land in turn if all takes at most so much longer by that.
-    """
-
-    distance_m: float = APART.distance_m
-    height_m: float = APART.height_m
-    layers: int = 4
+    distance_m: float = APART.distance_m  # horizontally, or
+    height_m: float = APART.height_m  # vertically, the height of a layer
+    layers: int = 4  # how many layers there are above the legs' height
+    # how much earlier or later than planned a vehicle may be. Around a start that vehicles share, it is what their
+    # autopilots need there (`takeoff_slack_s`, `landing_slack_s`), at most this
     slack_s: float = ARDUPILOT.schedule_slack_s
-    launch_s: float = PLANNING.launch_s
-    swap_s: float = 120.0
+    launch_s: float = PLANNING.launch_s  # time between takeoffs, and between landings, at one start
+    swap_s: float = 120.0  # time on the ground between a vehicle's sorties
+    # vehicles of one start take off and land in turn if all takes at most so much longer by that
     in_turn_share: float = PLANNING.in_turn_share
 
     @property
@@ -61,51 +53,32 @@ class Separation:
 
 @dataclass(frozen=True)
 class Slot:
-    """What a sortie was given.
+    """What a sortie was given."""
 
-    Attributes:
-        out_layer: layer of its way out, 0 is the legs' height.
-        home_layer: layer of its way home.
-        start_s: its takeoff, seconds after the swarm's start.
-        flight: its path.
-    """
-
-    out_layer: int
-    home_layer: int
-    start_s: float
-    flight: Flight
+    out_layer: int  # layer of its way out, 0 is the legs' height
+    home_layer: int  # layer of its way home
+    start_s: float  # its takeoff, seconds after the swarm's start
+    flight: Flight  # its path
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """What all sorties were given.
+    """What all sorties were given."""
 
-    Attributes:
-        slots: per vehicle and sortie.
-        in_turn: vehicles of one start keep apart in height as they take off and land; if not, in time alone.
-        saved_s: by at least how much all is done sooner without that, 0 if they do.
-    """
-
-    slots: list[list[Slot]]
-    in_turn: bool = True
-    saved_s: float = 0.0
+    slots: list[list[Slot]]  # per vehicle and sortie
+    in_turn: bool = True  # vehicles of one start keep apart in height as they take off and land; if not, in time alone
+    saved_s: float = 0.0  # by at least how much all is done sooner without that, 0 if they do
 
 
 @dataclass(frozen=True)
 class _Track:
-    """Positions every half second in the air.
+    """Positions every half second in the air."""
 
-    Attributes:
-        home: float64 (2,), where it takes off. ground: so many samples pass on the ground before the first.
-        places: float64 (n, 3). pad: bool (n,), around its home.
-        slack: int64 (n,), off schedule by so many samples where it shares its start: less as it takes off.
-    """
-
-    home: Array
-    ground: int
-    places: Array
-    pad: Flags
-    slack: Indices
+    home: Array  # float64 (2,), where it takes off
+    ground: int  # so many samples pass on the ground before the first
+    places: Array  # float64 (n, 3)
+    pad: Flags  # bool (n,), around its home
+    slack: Indices  # int64 (n,), off schedule by so many samples where it shares its start: less as it takes off
 
 
 def _sampled(flight: Flight, motion: Motion, apart: Separation) -> _Track:
@@ -162,36 +135,15 @@ def _forbid(mine, begin, slacks, others, when, other_slacks, bins, raster, apart
                             marks[last + 1] -= 1
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Frozen:
-    """Samples of the placed flights in raster cells: around a start that the next one shares, or elsewhere."""
+_Placed = tuple[Array, Indices, Indices, tuple[Indices, Indices], Array]  # others, when, other_slacks, bins, raster
 
-    pad: bool
-    points: Array
-    when: Indices
-    slack: Indices
-    bins: tuple[Indices, Indices]
-    raster: Array
 
-    @classmethod
-    def of(cls, pad: bool, points: Array, when: Indices, slack: Indices, cell_m: float) -> "_Frozen":
-        low, high = points[:, :2].min(0), points[:, :2].max(0)
-        cell = max(cell_m, float((high - low).max()) / 1000.0)
-        shape = ((high - low) / cell).astype(np.int64) + 1
-        raster = np.array([*low, cell, *shape], np.float64)
-        bins = _bins(points, low, cell, shape)
-        return cls(pad=pad, points=points, when=when, slack=slack, bins=bins, raster=raster)
-
-    def forbid(
-        self,
-        points: Array,
-        when: Indices,
-        slack: Indices,
-        apart: Array,
-        marks: Indices,
-    ) -> None:
-        """Mark delays at which samples of another track come near; see `_forbid`."""
-        _forbid(points, when, slack, self.points, self.when, self.slack, self.bins, self.raster, apart, marks)
+def _in_cells(points: Array, when: Indices, slack: Indices, cell_m: float) -> _Placed:
+    """Samples of placed flights in raster cells, as `_forbid` takes them."""
+    low, high = points[:, :2].min(0), points[:, :2].max(0)
+    cell = max(cell_m, float((high - low).max()) / 1000.0)
+    shape = ((high - low) / cell).astype(np.int64) + 1
+    return points, when, slack, _bins(points, low, cell, shape), np.array([*low, cell, *shape], np.float64)
 
 
 class _Sky:
@@ -229,8 +181,8 @@ class _Sky:
         self._tracks.append((best[3], best[2]))
         return best[1]
 
-    def _frozen(self, home: Array) -> list[_Frozen]:
-        """The placed samples around a start shared with a vehicle at home, and all others."""
+    def _frozen(self, home: Array) -> list[tuple[bool, _Placed]]:
+        """The placed samples elsewhere, and around a start shared with a vehicle at home (True)."""
         if not self._tracks:
             return []
         points = np.concatenate([t.places for _, t in self._tracks])
@@ -239,7 +191,7 @@ class _Sky:
         slack = np.concatenate([t.slack for _, t in self._tracks])
         slack[~pad] = self._slack
         kinds = ((False, ~pad), (True, pad))
-        return [_Frozen.of(near, points[w], when[w], slack[w], self._reach) for near, w in kinds if w.any()]
+        return [(near, _in_cells(points[w], when[w], slack[w], self._reach)) for near, w in kinds if w.any()]
 
     @property
     def _slack(self) -> int:
@@ -261,21 +213,21 @@ class _Sky:
         """Two places of takeoff count as one start."""
         return bool(np.hypot(*(home - other)) < self._apart.pad_m)
 
-    def _meetings(self, track: _Track, ready: int, frozen: list[_Frozen], marks: Indices) -> None:
+    def _meetings(self, track: _Track, ready: int, frozen: list[tuple[bool, _Placed]], marks: Indices) -> None:
         """Mark delays that bring a track too near a placed one, or to the same start at the same time."""
         apart = self._apart
         # Layers are apart: the hair keeps neighbouring ones from clashing by rounding.
         limits = np.array([self._reach, apart.height_m - 0.01])
         when = ready + track.ground + np.arange(len(track.places))
         usual = np.full(len(when), self._slack)
-        for other in frozen:
-            away = ~track.pad if other.pad else np.ones(len(when), bool)
-            other.forbid(track.places[away], when[away], usual[away], limits, marks)
+        for near, placed in frozen:
+            away = ~track.pad if near else np.ones(len(when), bool)
+            _forbid(track.places[away], when[away], usual[away], *placed, limits, marks)
             if self._in_turn:
-                other.forbid(track.places[~away], when[~away], track.slack[~away], limits, marks)
-        for start, placed in self._tracks:
-            if self._shared(placed.home, track.home):
-                landing = start + placed.ground + len(placed.places) - track.ground - len(track.places)
+                _forbid(track.places[~away], when[~away], track.slack[~away], *placed, limits, marks)
+        for start, other in self._tracks:
+            if self._shared(other.home, track.home):
+                landing = start + other.ground + len(other.places) - track.ground - len(track.places)
                 _mark(marks, landing - ready, int(np.ceil(apart.launch_s / _STEP_S)) - 1)
 
 
@@ -295,9 +247,7 @@ def separate(sorties: Sequence[Sequence[Maker]], motions: Sequence[Motion], apar
 
     Args:
         sorties: per vehicle and sortie, what makes its flight with the way out, and the way home, so many metres
-            higher than the legs.
-        motions: say where each vehicle is when.
-        apart: the distances to keep.
+            higher than the legs. motions: say where each vehicle is when. apart: the distances to keep.
     """
     usual = _Placing(sorties, motions, apart)
     if not usual.shares_starts:

@@ -29,25 +29,16 @@ def profile_step_m(*grounds: Terrain) -> float:
 
 @dataclass(frozen=True)
 class LevelHeights:
-    """All legs at one height.
+    """All legs at one height."""
 
-    Attributes:
-        z_m: height of the legs.
-        ground: heights of the ground, None where only the height above takeoff counts. highest: the highest ground
-            up to `BESIDE_M` from each place.
-        nominal_m: height above the ground that was asked for, None for z_m.
-        follows: False, as heights do not follow the ground. by_vehicle: False, likewise.
-        least_above_m: what flights keep over the highest ground.
-    """
-
-    z_m: float
+    z_m: float  # height of the legs
     _: KW_ONLY
-    ground: Terrain | None = None
-    highest: Terrain | None = None
-    nominal_m: float | None = None
-    follows: bool = False
-    by_vehicle: bool = False
-    least_above_m: float = PLANNING.least_above_ground_m
+    ground: Terrain | None = None  # heights of the ground, None where only the height above takeoff counts
+    highest: Terrain | None = None  # the highest ground up to `BESIDE_M` from each place
+    nominal_m: float | None = None  # height above the ground that was asked for, None for z_m
+    follows: bool = False  # False, as heights do not follow the ground
+    by_vehicle: bool = False  # False, likewise
+    least_above_m: float = PLANNING.least_above_ground_m  # what flights keep over the highest ground
 
     @property
     def above_m(self) -> float:
@@ -72,20 +63,15 @@ class GroundHeights:
     """A constant height above the ground within a tolerance, on straight pieces as long as that allows.
 
     Beside ground that is much higher a flight is higher than that: `least_above_m` above it.
-
-    Attributes:
-        ground: heights of the ground. highest: the highest ground up to `BESIDE_M` from each place.
-        above_m: height above the ground. tolerance_m: largest difference from it.
-        follows: True, as heights follow the ground.
-        by_vehicle: the vehicle itself keeps its height above the ground, so that points put in for their height are no
-            mission items, and no ground beside it lifts it.
     """
 
-    ground: Terrain
-    highest: Terrain
-    above_m: float
-    tolerance_m: float
-    follows: bool = True
+    ground: Terrain  # heights of the ground
+    highest: Terrain  # the highest ground up to `BESIDE_M` from each place
+    above_m: float  # height above the ground
+    tolerance_m: float  # largest difference from it
+    follows: bool = True  # True, as heights follow the ground
+    # the vehicle itself keeps its height above the ground, so that points put in for their height are no mission items,
+    # and no ground beside it lifts it
     by_vehicle: bool = False
     least_above_m: float = PLANNING.least_above_ground_m
     _known: dict[tuple[float, ...], Array] = field(default_factory=dict, repr=False, compare=False)

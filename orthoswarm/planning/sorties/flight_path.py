@@ -18,32 +18,19 @@ _STRAIGHT_COS: Final = 0.985  # a vehicle comes straight into a leg up to this a
 
 @dataclass(frozen=True, kw_only=True)
 class Flight:
-    """The path of one sortie.
+    """The path of one sortie."""
 
-    Attributes:
-        home: float64 (2,), where it takes off.
-        climb_m: height to climb to at home.
-        points: float64 (n, 3), waypoints: easting, northing, height (see `flight_heights`).
-        camera: int8 (n,): 1 at a leg's first point, -1 at its last, else 0.
-        returns: the last point is above home, and the vehicle comes down there.
-        home_z_m: height of the ground at home.
-        above_m: float64 (n,), nominal height above the ground of each point; NaN where heights do not follow the
-            ground.
-        between: bool (n,), points on a straight way, put in for their height alone.
-        wait_s: how long it stays where its last leg ends before it comes home.
-        ground_by_vehicle: the vehicle keeps its height above the ground by itself, without those points.
-    """
-
-    home: Array
-    climb_m: float
-    points: Array
-    camera: NDArray[np.int8]
-    returns: bool
-    home_z_m: float
+    home: Array  # float64 (2,), where it takes off
+    climb_m: float  # height to climb to at home
+    points: Array  # float64 (n, 3), waypoints: easting, northing, height (see `flight_heights`)
+    camera: NDArray[np.int8]  # int8 (n,): 1 at a leg's first point, -1 at its last, else 0
+    returns: bool  # the last point is above home, and the vehicle comes down there
+    home_z_m: float  # height of the ground at home
+    # float64 (n,), nominal height above the ground of each point; NaN where heights do not follow the ground
     above_m: Array
-    between: Flags
-    ground_by_vehicle: bool = False
-    wait_s: float = 0.0
+    between: Flags  # bool (n,), points on a straight way, put in for their height alone
+    ground_by_vehicle: bool = False  # the vehicle keeps its height above the ground by itself, without those points
+    wait_s: float = 0.0  # how long it stays where its last leg ends before it comes home
 
     def track(self) -> Array:
         """The whole path from the ground on, (n, 3)."""
@@ -97,13 +84,9 @@ def make_flight(
     """The flight over a row of legs.
 
     Args:
-        legs: float64 (n, 2, 2) in flying order.
-        home: float64 (2,).
-        heights: of the legs and of the ways between them.
-        router: finds ways around obstacles.
-        returns: fly back above home at the end.
-        out_m: how much higher the way out is.
-        home_m: how much higher the way home is.
+        legs: float64 (n, 2, 2) in flying order. home: float64 (2,). heights: of the legs and of the ways between them.
+        router: finds ways around obstacles. returns: fly back above home at the end.
+        out_m: how much higher the way out is. home_m: how much higher the way home is.
         run_in_m: length of a straight, in line with the leg, before its first picture; left out where an obstacle or
             the start lies in the way, and where the vehicle comes straight on.
     """
@@ -156,16 +139,10 @@ def _raised(flat: list[tuple[Array, float, int]], start: Array, heights: FlightH
     above = np.array(mores) + heights.above_m if heights.follows else np.full(len(points), np.nan)
     home = start[:2]
     return Flight(
-        home=home,
-        climb_m=float(start[2]),
-        points=np.array(points),
-        camera=np.array(camera, np.int8),
-        returns=returns,
-        home_z_m=heights.ground_at(home),
-        above_m=above,
-        between=np.array(between, bool),
+        home=home, climb_m=float(start[2]), points=np.array(points), camera=np.array(camera, np.int8), returns=returns,
+        home_z_m=heights.ground_at(home), above_m=above, between=np.array(between, bool),
         ground_by_vehicle=heights.by_vehicle,
-    )
+    )  # fmt: skip
 
 
 def _entry(leg: Array, before: Array, router: Router, run_in_m: float) -> Array:

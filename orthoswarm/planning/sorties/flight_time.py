@@ -17,24 +17,16 @@ _RAMP = 5  # places at which a change of speed is followed
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """A multirotor: constant speed on straights, and what its autopilot loses in turns, takeoff and landing.
+    """A multirotor: constant speed on straights, and what its autopilot loses in turns, takeoff and landing."""
 
-    Attributes:
-        speed_m_s: ground speed without wind.
-        climb_m_s: rate of climb.
-        descent_m_s: rate of descent.
-        wind_m_s: where the wind blows to, east and north. The speed is then that through the air.
-        autopilot: acceleration in turns, and the times of takeoff and landing.
-        lands: its flights end with LAND; if not, with a return to launch, which waits above home first.
-    """
-
-    speed_m_s: float = 10.0
+    speed_m_s: float = 10.0  # ground speed without wind
     _: KW_ONLY
-    climb_m_s: float = 2.5
-    descent_m_s: float = 1.5
+    climb_m_s: float = 2.5  # rate of climb
+    descent_m_s: float = 1.5  # rate of descent
+    # where the wind blows to, east and north. The speed is then that through the air
     wind_m_s: tuple[float, float] = (0.0, 0.0)
-    autopilot: AutopilotTimes = ARDUPILOT
-    lands: bool = False
+    autopilot: AutopilotTimes = ARDUPILOT  # acceleration in turns, and the times of takeoff and landing
+    lands: bool = False  # its flights end with LAND; if not, with a return to launch, which waits above home first
 
     @property
     def crab_rad(self) -> float:
@@ -105,8 +97,7 @@ class Motion:
         Where time is lost is known as well as how much: slow first metres of the climb, a wait above home, gathering
         speed; slowing down, a wait above home, slow last metres.
 
-        Args:
-            points: float64 (n, 3), the path. waits_s: float64 (n,), seconds that it stays before each point.
+        points: float64 (n, 3), the path. waits_s: float64 (n,), seconds that it stays before each point.
         """
         times = self.times(points) + (0.0 if waits_s is None else np.cumsum(waits_s))
         step = np.diff(points, axis=0)
@@ -185,8 +176,7 @@ class Motion:
 def start_slack_s(near_start: Flags, autopilot: AutopilotTimes) -> Array:
     """Seconds off schedule that a plan allows a flight around a start that vehicles share, float64 (n,).
 
-    Args:
-        near_start: bool (n,), which of its samples are there. Before it has left it first it takes off, then it lands.
+    near_start: bool (n,), which of its samples are there. Before it has left it first it takes off, then it lands.
     """
     takes_off = np.arange(len(near_start)) < np.argmin(near_start)
     return np.where(takes_off, autopilot.takeoff_slack_s, autopilot.landing_slack_s)

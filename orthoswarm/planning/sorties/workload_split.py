@@ -27,19 +27,12 @@ _CUTS_PER_SHARE: Final = 24  # possible cuts in a share (for its time)
 
 @dataclass(frozen=True)
 class Row:
-    """Legs in flying order, cut at every place where a piece may end.
+    """Legs in flying order, cut at every place where a piece may end."""
 
-    Attributes:
-        parts: float64 (n, 2, 2), straight parts of legs.
-        leg: int64 (n,), the leg that each part belongs to.
-        begin_s: float64 (n,), time at which each part begins when the whole row is flown; end_s when it ends.
-        end_s: float64 (n,).
-    """
-
-    parts: Array
-    leg: Indices
-    begin_s: Array
-    end_s: Array
+    parts: Array  # float64 (n, 2, 2), straight parts of legs
+    leg: Indices  # int64 (n,), the leg that each part belongs to
+    begin_s: Array  # float64 (n,), time at which each part begins when the whole row is flown; end_s when it ends
+    end_s: Array  # float64 (n,)
 
     def legs(self, begin: int, end: int) -> Array:
         """Parts begin to end - 1 put together to legs again: float64 (m, 2, 2)."""
@@ -55,11 +48,8 @@ def cut(
     """A row of legs with places to cut.
 
     Args:
-        legs: float64 (n, 2, 2) in flying order.
-        router: measures the ways between legs.
-        motion: gives times.
-        shares: into how many pieces the row is meant to be cut.
-        least_m: shortest part of a leg.
+        legs: float64 (n, 2, 2) in flying order. router: measures the ways between legs. motion: gives times.
+        shares: into how many pieces the row is meant to be cut. least_m: shortest part of a leg.
         step_m: longest part; by default a small fraction of a share.
     """
     length = np.hypot(*(legs[:, 1] - legs[:, 0]).T)
@@ -84,19 +74,13 @@ def cut(
 
 @dataclass(frozen=True)
 class Limits:
-    """What a single flight may cost.
+    """What a single flight may cost."""
 
-    Attributes:
-        endurance_s: longest flight, one for all vehicles or float64 (vehicles,); infinite without a limit.
-        fixed_s: climb and descent, in every flight.
-        swap_s: time on the ground between flights.
-        most_legs: legs that one mission can hold.
-    """
-
+    # longest flight, one for all vehicles or float64 (vehicles,); infinite without a limit
     endurance_s: float | Array = np.inf
-    fixed_s: float = 0.0
-    swap_s: float = 0.0
-    most_legs: int = 1_000_000
+    fixed_s: float = 0.0  # climb and descent, in every flight
+    swap_s: float = 0.0  # time on the ground between flights
+    most_legs: int = 1_000_000  # legs that one mission can hold
 
 
 @kernel
@@ -195,12 +179,9 @@ def share(
     """Which parts each vehicle flies: begin and end (exclusive) per vehicle; None where the limits allow no way.
 
     Args:
-        row: the legs with places to cut.
-        vehicles: how many.
+        row: the legs with places to cut. vehicles: how many.
         starts: float64 (vehicles, 2), each vehicle's start; None puts it where its piece begins.
-        returns: vehicles fly back to their start.
-        router: measures the ways out and home.
-        motion: gives times.
+        returns: vehicles fly back to their start. router: measures the ways out and home. motion: gives times.
         limits: of a single flight; a piece may take several.
     """
     nothing = np.zeros((vehicles, len(row.parts)))
@@ -238,12 +219,8 @@ def sorties(
     """Fewest flights from one start that fly a whole row within the limits, evenly cut; None where there is no way.
 
     Args:
-        row: one vehicle's legs with places to cut.
-        start: float64 (2,).
-        returns: each flight goes back to the start.
-        router: measures the ways out and home.
-        motion: gives times.
-        limits: of each flight; one endurance.
+        row: one vehicle's legs with places to cut. start: float64 (2,). returns: each flight goes back to the start.
+        router: measures the ways out and home. motion: gives times. limits: of each flight; one endurance.
     """
     out = router.distances(start, row.parts[:, 0]) / motion.even_speed_m_s
     home = router.distances(start, row.parts[:, 1]) / motion.even_speed_m_s * returns
@@ -260,15 +237,9 @@ def sorties(
         return [(0, len(row.parts))]
     for flights in range(count, min(count + 4, len(row.parts)) + 1):
         cuts = _evenly(
-            row,
-            np.repeat(out, flights, 0),
-            np.repeat(home, flights, 0),
-            motion,
-            limits,
-            own=False,
-            returns=returns,
+            row, np.repeat(out, flights, 0), np.repeat(home, flights, 0), motion, limits, own=False, returns=returns,
             single=True,
-        )
+        )  # fmt: skip
         if cuts is not None:
             return _pairs(cuts)
     return None

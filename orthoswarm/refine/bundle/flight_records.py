@@ -11,7 +11,7 @@ from orthoswarm.model.arrays import Array, Flags
 from orthoswarm.model.camera import rotation_from_angles
 from orthoswarm.model.frame import DEFAULT_HEIGHT_M, Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.trajectory.courses import course
+from orthoswarm.trajectory.legs import course
 
 _COURSE_REACH_PHOTOS: Final = 3  # flown steps are medians over so many photos before and after
 _COURSE_TURN_DEG: Final = 12.0  # ... of those whose heading differs by less

@@ -19,7 +19,7 @@ from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Leg, MapWindow, PlacedFrame, Solution
 from orthoswarm.mosaic.recorded_pose import hint_lone_photos, recorded_cameras
 from orthoswarm.refine.flight.unsolved_pictures import RefinableSplit, place_by_neighbours, split_refinable
-from orthoswarm.trajectory.separate_places import separate_places
+from orthoswarm.trajectory.near_paths import separate_places
 
 LONGEST_UNIT_PHOTOS: Final = 600
 """Longer flights are solved in stretches that hold each other as neighbours, so that cost and memory stay bounded."""

@@ -280,7 +280,7 @@ def by_learning(strip: Strip, device: str) -> Found | None:
 
     device: where the network runs.
     """
-    from orthoswarm.matchers.second_opinion import second_opinion
+    from orthoswarm.matchers.patch_registration import second_opinion
 
     shift = second_opinion(strip.gray, strip.valid, strip.ground, known=strip.known, reach=strip.reach, device=device)
     return None if shift is None else (float(shift[0]), float(shift[1]), 1.0, 0.0)

@@ -9,8 +9,7 @@ from orthoswarm.twin.city.scene import CELL_M, TEXEL_M, Scene
 from orthoswarm.twin.city.stamps import stamp_building, stamp_tree
 
 Color = tuple[float, float, float]
-Area = tuple[float, float, float, float]
-"""u0, v0, u1, v1 of a rectangle in the city's frame, metres."""
+Area = tuple[float, float, float, float]  # u0, v0, u1, v1 of a rectangle in the city's frame, metres
 
 LAWNS: list[Color] = [(96, 118, 62), (110, 128, 72), (84, 104, 58), (128, 130, 84), (140, 130, 92)]
 ROOFS: list[Color] = [

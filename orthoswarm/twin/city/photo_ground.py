@@ -63,8 +63,7 @@ def load_ground(ground: tuple[str, str, str], center: tuple[float, float], half:
 
     Args:
         ground: paths of orthoimage, surface model and terrain model (empty: the lower envelope of the surface model).
-        center: grid coordinates in the orthoimage's CRS.
-        half: half extent, east and north, in metres.
+        center: grid coordinates in the orthoimage's CRS. half: half extent, east and north, in metres.
 
     Raises:
         InputError: for files without a common projected CRS.
@@ -88,7 +87,12 @@ def load_ground(ground: tuple[str, str, str], center: tuple[float, float], half:
         bare, bare_place, _ = _heights(ground[2], "bare ground")
         dtm = _sample(_fill(bare), bare_place, scene, step=CELL_M, border=image.shape, frame=place)
     else:
-        dtm = _lower_envelope(surface)
+        # Bare ground from the surface: morphological opening over 60 m, smoothed.
+        small = cv2.erode(
+            cv2.resize(surface, None, fx=0.125, fy=0.125, interpolation=cv2.INTER_AREA), np.ones((15, 15))
+        )
+        opened = cv2.GaussianBlur(cv2.dilate(small, np.ones((15, 15))), (0, 0), 3.0)
+        dtm = np.asarray(cv2.resize(opened, (surface.shape[1], surface.shape[0]), interpolation=cv2.INTER_LINEAR))
     level = float(np.median(dtm))
     scene.dtm[:] = np.minimum(dtm, surface) - level
     scene.dsm[:] = surface - level
@@ -139,15 +143,6 @@ def _sample(data: Any, place: Any, scene: Scene, *, step: float, border: tuple[i
 def _mirror(x: Array, length: float) -> Array:
     m = np.mod(x, 2.0 * length)
     return np.asarray(np.where(m > length, 2.0 * length - m, m))
-
-
-def _lower_envelope(surface: Floats) -> Floats:
-    """Bare ground from a surface: morphological opening over 60 m, smoothed."""
-    import cv2
-
-    small = cv2.erode(cv2.resize(surface, None, fx=0.125, fy=0.125, interpolation=cv2.INTER_AREA), np.ones((15, 15)))
-    opened = cv2.GaussianBlur(cv2.dilate(small, np.ones((15, 15))), (0, 0), 3.0)
-    return np.asarray(cv2.resize(opened, (surface.shape[1], surface.shape[0]), interpolation=cv2.INTER_LINEAR))
 
 
 def _classify(scene: Scene) -> None:

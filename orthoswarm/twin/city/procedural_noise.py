@@ -46,10 +46,8 @@ def noise_field(shape: tuple[int, int], step_m: float, scale_m: float, octaves: 
     """Fractal noise, float32 of `shape`, about -1 to 1.
 
     Args:
-        shape: rows, columns.
-        step_m: side of a cell.
-        scale_m: size of the largest features; each further octave is about half of it.
-        octaves: how many.
+        shape: rows, columns. step_m: side of a cell.
+        scale_m: size of the largest features; each further octave is about half of it. octaves: how many.
         seed: of the noise.
     """
     out = np.empty(shape, np.float32)

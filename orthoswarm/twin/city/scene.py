@@ -8,12 +8,9 @@ from orthoswarm.model.arrays import Bytes, Floats
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
 
-TEXEL_M = 0.25
-"""Side of a texture pixel, metres."""
-CELL_M = 0.5
-"""Side of a cell of the height fields, metres: two texels."""
-TILE_CELLS = 16
-"""Cells along the side of a tile of the renderer's table of highest points."""
+TEXEL_M = 0.25  # side of a texture pixel, metres
+CELL_M = 0.5  # side of a cell of the height fields, metres: two texels
+TILE_CELLS = 16  # cells along the side of a tile of the renderer's table of highest points
 
 GRASS, ASPHALT, CONCRETE, SOIL, FIELD, WATER, ROOF, TREE, CAR, MARK, RUBBLE, PHOTO = range(12)
 """Kinds of surface; they decide texture, seasonal colour, and whether the surface moves (WATER)."""
@@ -22,42 +19,27 @@ KINDS = 12
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:
-    """Colours on a 0.25 m grid and heights on a 0.5 m grid over the same bounds (multiples of 3 m).
+    """Colours on a 0.25 m grid and heights on a 0.5 m grid over the same bounds (multiples of 3 m)."""
 
-    Attributes:
-        grid: the texture's grid, CRS and place.
-        albedo: uint8 (rows, columns, 3), colours without light and shadow, seen from straight above.
-        kind: uint8 (rows, columns), kind of surface of each texel.
-        dsm: float32 (rows/2, columns/2), height of the surface with all that stands on it, metres over takeoff.
-        dtm: float32 (rows/2, columns/2), height of the bare ground.
-        wall: uint8 (rows/2, columns/2, 3), colour of a vertical face below the cell's top.
-        facade: uint8 (rows/2, columns/2), 1 where the vertical face has windows.
-        angle_rad: main direction of the walls, anticlockwise from east.
-    """
-
-    grid: GroundGrid
-    albedo: Bytes
-    kind: Bytes
-    dsm: Floats
-    dtm: Floats
-    wall: Bytes
-    facade: Bytes
-    angle_rad: float = 0.0
+    grid: GroundGrid  # the texture's grid, CRS and place
+    albedo: Bytes  # uint8 (rows, columns, 3), colours without light and shadow, seen from straight above
+    kind: Bytes  # uint8 (rows, columns), kind of surface of each texel
+    dsm: Floats  # float32 (rows/2, columns/2), height of the surface with all that stands on it, metres over takeoff
+    dtm: Floats  # float32 (rows/2, columns/2), height of the bare ground
+    wall: Bytes  # uint8 (rows/2, columns/2, 3), colour of a vertical face below the cell's top
+    facade: Bytes  # uint8 (rows/2, columns/2), 1 where the vertical face has windows
+    angle_rad: float = 0.0  # main direction of the walls, anticlockwise from east
 
     @classmethod
     def blank(cls, grid: GroundGrid, angle_rad: float = 0.0) -> "Scene":
         """A level, black scene on a texture grid whose sides are even."""
         rows, cols = grid.height // 2, grid.width // 2
         return cls(
-            grid=grid,
-            albedo=np.zeros((grid.height, grid.width, 3), np.uint8),
-            kind=np.zeros((grid.height, grid.width), np.uint8),
-            dsm=np.zeros((rows, cols), np.float32),
-            dtm=np.zeros((rows, cols), np.float32),
-            wall=np.zeros((rows, cols, 3), np.uint8),
-            facade=np.zeros((rows, cols), np.uint8),
-            angle_rad=angle_rad,
-        )
+            grid=grid, albedo=np.zeros((grid.height, grid.width, 3), np.uint8),
+            kind=np.zeros((grid.height, grid.width), np.uint8), dsm=np.zeros((rows, cols), np.float32),
+            dtm=np.zeros((rows, cols), np.float32), wall=np.zeros((rows, cols, 3), np.uint8),
+            facade=np.zeros((rows, cols), np.uint8), angle_rad=angle_rad,
+        )  # fmt: skip
 
     @property
     def wall_axis(self) -> tuple[float, float]:

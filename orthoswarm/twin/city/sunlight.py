@@ -13,16 +13,11 @@ from orthoswarm.twin.city.scene import CELL_M, Scene
 
 @dataclass(frozen=True, slots=True)
 class Sun:
-    """Direction of the sun and share of ambient light.
+    """Direction of the sun and share of ambient light."""
 
-    Attributes:
-        azimuth_rad: clockwise from grid north. elevation_rad: above the horizon.
-        ambient: share of the light that reaches a shadow.
-    """
-
-    azimuth_rad: float
-    elevation_rad: float
-    ambient: float = 0.42
+    azimuth_rad: float  # clockwise from grid north
+    elevation_rad: float  # above the horizon
+    ambient: float = 0.42  # share of the light that reaches a shadow
 
     def direction(self) -> tuple[float, float, float]:
         """Unit vector towards the sun: columns (east), rows (south), up."""

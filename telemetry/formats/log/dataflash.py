@@ -55,8 +55,7 @@ class _Format:
 def read_dataflash(path: Path) -> FlightLog:
     """Read a DataFlash log; damaged parts are skipped.
 
-    Raises:
-        OSError: it cannot be read. NotALog: it is not a DataFlash log.
+    Raises OSError: it cannot be read; NotALog: it is not a DataFlash log.
     """
     with mapped(path) as data:
         rows = _rows(data)
@@ -185,14 +184,10 @@ def _utc_s(row: Row, clock: float | None) -> float | None:
 
 def _event(row: Row, kind: str, clock: float | None) -> ExposureEvent:
     sample = Sample(
-        lat_deg=row.get("Lat"),
-        lon_deg=row.get("Lng"),
-        altitude_m=row.get("Alt"),
-        height_m=row.get("RelAlt"),
-        flight_roll_deg=row.get("R", row.get("Roll")),
-        flight_pitch_deg=row.get("P", row.get("Pitch")),
+        lat_deg=row.get("Lat"), lon_deg=row.get("Lng"), altitude_m=row.get("Alt"), height_m=row.get("RelAlt"),
+        flight_roll_deg=row.get("R", row.get("Roll")), flight_pitch_deg=row.get("P", row.get("Pitch")),
         flight_yaw_deg=row.get("Y", row.get("Yaw")),
-    )
+    )  # fmt: skip
     time_s = _utc_s(row, clock)
     if time_s is None and row.get("GPSWeek", 0) > 1000:
         time_s = GPS_EPOCH_S + row["GPSWeek"] * WEEK_S + row["GPSTime"] * 1e-3 - GPS_MINUS_UTC_S

@@ -32,17 +32,11 @@ _RTK_FIXED_M, _RTK_FLOAT_M = 0.02, 0.3
 
 @dataclass(frozen=True, slots=True)
 class NodePose:
-    """The content of one message.
+    """The content of one message."""
 
-    Attributes:
-        sample: a position, the airframe's attitude or the camera's; its time is UTC.
-        node: DroneCAN node id of the sender, 1 to 127.
-        sigma: stated one sigma, metres of a position, degrees of an attitude; None where it is not stated.
-    """
-
-    sample: Sample
-    node: int
-    sigma: float | None
+    sample: Sample  # a position, the airframe's attitude or the camera's; its time is UTC
+    node: int  # DroneCAN node id of the sender, 1 to 127
+    sigma: float | None  # stated one sigma, metres of a position, degrees of an attitude; None where it is not stated
 
 
 class DronecanPoses:

@@ -31,27 +31,29 @@ _MARK = re.compile(
     rf"^(\d+)\s+(\d+\.\d+)\s+\[(\d+)\].*?{_NUMBER},Lat\s+{_NUMBER},Lon\s+{_NUMBER},Ellh\s+{_NUMBER},{_NUMBER}",
     re.MULTILINE,
 )
-_SCALES: Final = {"GPST": GPS_MINUS_UTC_S, "UTC": 0.0, "JST": 9 * 3600.0}
-"""Seconds that a time scale is ahead of UTC."""
+_SCALES: Final = {"GPST": GPS_MINUS_UTC_S, "UTC": 0.0, "JST": 9 * 3600.0}  # seconds that a time scale is ahead of UTC
 _FIXED, _FLOAT = 1.0, 2.0
 _LEAST_EPOCHS = 10
 _EVEN_S, _EVEN_SHARE = 0.005, 0.9
 """Epochs of a receiver follow each other evenly to a millisecond, apart from missing ones; a camera that takes pictures
 every two seconds does so to some hundredths (chosen), or evenly, too, where its times were rounded."""
-_MOST_STEP_S = 1.0
-"""Receivers log one to twenty epochs a second; photos for a map are seldom taken that often."""
+_MOST_STEP_S = 1.0  # receivers log one to twenty epochs a second; photos for a map are seldom taken that often
 
 
 def read_exposure_list(path: Path) -> FlightLog:
-    """Read a list of exposures, or a receiver's track.
-
-    Raises:
-        OSError: it cannot be read. NotALog: it is neither.
-    """
+    """Read a list of exposures, or a receiver's track. Raises OSError: it cannot be read; NotALog: it is neither."""
     with path.open("rb") as handle:
         text = handle.read(MOST_TEXT_BYTES).decode("utf-8-sig", "replace")
     if path.suffix.lower() == ".mrk":
-        log = FlightLog(path=path, kind="DJI MRK", vehicle=path.stem, events=_marks(text))
+        events = []
+        for match in _MARK.finditer(text):
+            number, seconds, week, lat, lon, height, sigma_north, sigma_east = (
+                float(group) for group in match.groups()
+            )
+            time_s = GPS_EPOCH_S + week * WEEK_S + seconds - GPS_MINUS_UTC_S
+            sigma = max(sigma_north, sigma_east) or None
+            events += _event(time_s, int(number), Sample(lat_deg=lat, lon_deg=lon, altitude_m=height, sigma_m=sigma))
+        log = FlightLog(path=path, kind="DJI MRK", vehicle=path.stem, events=events)
     else:
         log = _solution(path, text)
     if not log.events and not log.samples:
@@ -60,23 +62,21 @@ def read_exposure_list(path: Path) -> FlightLog:
 
 
 def _solution(path: Path, text: str) -> FlightLog:
-    positions = _positions(text)
+    columns = _PositionColumns(GPS_MINUS_UTC_S, 3, _degrees)
+    positions = []
+    for line in text.splitlines():
+        if line.startswith("%"):
+            columns = _header(_words(line[1:])) or columns
+            continue
+        sample = _sample(_words(line), columns)
+        if sample is not None:
+            positions.append(sample)
     if _is_track(path.stem, positions):
         # A photo's place on a track is as good as the camera's clock, not as the receiver's fix.
         samples = [replace(position, sigma_m=None) for position in positions]
         return FlightLog(path=path, kind="RTKLIB track", vehicle=path.stem, samples=samples)
     events = [event for i, s in enumerate(positions) for event in _event(s.time_s or 0.0, i + 1, s)]
     return FlightLog(path=path, kind="RTKLIB events", vehicle=path.stem, events=events)
-
-
-def _marks(text: str) -> list[ExposureEvent]:
-    events = []
-    for match in _MARK.finditer(text):
-        number, seconds, week, lat, lon, height, sigma_north, sigma_east = (float(group) for group in match.groups())
-        time_s = GPS_EPOCH_S + week * WEEK_S + seconds - GPS_MINUS_UTC_S
-        sigma = max(sigma_north, sigma_east) or None
-        events += _event(time_s, int(number), Sample(lat_deg=lat, lon_deg=lon, altitude_m=height, sigma_m=sigma))
-    return events
 
 
 def _event(time_s: float, number: int, sample: Sample) -> list[ExposureEvent]:
@@ -88,36 +88,13 @@ def _event(time_s: float, number: int, sample: Sample) -> list[ExposureEvent]:
 
 @dataclass(frozen=True, slots=True)
 class _PositionColumns:
-    """What the header says.
+    """What the header says."""
 
-    Attributes:
-        ahead_s: time scale less UTC. words: number of words of a position.
-        position: latitude, longitude (degrees), height (metres) of these words as numbers.
-        deviations: number of the standard deviations that say something about the horizontal position.
-    """
-
-    ahead_s: float
-    words: int
+    ahead_s: float  # time scale less UTC
+    words: int  # number of words of a position
+    # latitude, longitude (degrees), height (metres) of these words as numbers
     position: Callable[[Sequence[float]], tuple[float, float, float]]
-    deviations: int = 2
-
-
-def _positions(text: str) -> list[Sample]:
-    """The positions of a solution, in the order of the file; times are UTC.
-
-    Raises:
-        NotALog: it states no positions on the earth.
-    """
-    columns = _PositionColumns(GPS_MINUS_UTC_S, 3, _degrees)
-    found = []
-    for line in text.splitlines():
-        if line.startswith("%"):
-            columns = _header(_words(line[1:])) or columns
-            continue
-        sample = _sample(_words(line), columns)
-        if sample is not None:
-            found.append(sample)
-    return found
+    deviations: int = 2  # number of the standard deviations that say something about the horizontal position
 
 
 def _is_track(stem: str, samples: Sequence[Sample]) -> bool:
@@ -159,7 +136,10 @@ def _sample(words: Sequence[str], columns: _PositionColumns) -> Sample | None:
         return None
     try:
         numbers = [float(word) for word in words[2 : end + 2 + columns.deviations]]
-        time_s = _time(words) - columns.ahead_s
+        written = epoch_of(" ".join(words[:2]))
+        time_s = (
+            GPS_EPOCH_S + int(words[0]) * WEEK_S + float(words[1]) if written is None else written
+        ) - columns.ahead_s
         lat, lon, height = columns.position(numbers[: columns.words])
     except ValueError:
         return None
@@ -168,16 +148,6 @@ def _sample(words: Sequence[str], columns: _PositionColumns) -> Sample | None:
     sigma = spread if quality in (_FIXED, _FLOAT) and spread > 0.0 else None
     sample = checked(Sample(time_s=time_s, lat_deg=lat, lon_deg=lon, altitude_m=height, sigma_m=sigma))
     return sample if sample is not None and sample.has_position and sample.time_s is not None else None
-
-
-def _time(words: Sequence[str]) -> float:
-    """Seconds of the line's own scale, counted like UTC since 1970.
-
-    Raises:
-        ValueError: it is no time.
-    """
-    written = epoch_of(" ".join(words[:2]))
-    return GPS_EPOCH_S + int(words[0]) * WEEK_S + float(words[1]) if written is None else written
 
 
 def _degrees(numbers: Sequence[float]) -> tuple[float, float, float]:

@@ -6,9 +6,8 @@ truncation and damage: a bad record is skipped up to the next good one.
 
 import mmap
 import os
-from collections.abc import Callable, Container
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -29,8 +28,7 @@ __all__ = ["FlightLog", "NotALog", "read_log", "read_tlog"]
 def read_log(path: Path) -> list[FlightLog]:
     """Read a log of any kind; returns one entry for each vehicle in it.
 
-    Raises:
-        NotALog: it is not a flight log, or holds nothing that can be used.
+    Raises NotALog: it is not a flight log, or holds nothing that can be used.
     """
     of_one_vehicle: dict[str, Callable[[Path], FlightLog]] = {
         ".bin": read_dataflash, ".ulg": read_ulog, ".pos": read_exposure_list, ".mrk": read_exposure_list,
@@ -102,8 +100,7 @@ _MAX_RECORDS = 100_000_000
 def read_tlog(path: Path) -> list[FlightLog]:
     """Read a tlog: 8 bytes of arrival time (microseconds, big-endian) before each MAVLink packet.
 
-    Raises:
-        OSError: it cannot be read. NotALog: no packet in it.
+    Raises OSError: it cannot be read; NotALog: no packet in it.
     """
     os.environ.setdefault("MAVLINK20", "1")
     from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -113,35 +110,27 @@ def read_tlog(path: Path) -> list[FlightLog]:
     decoder.robust_parsing = True
     vehicles: dict[int, _TlogVehicle] = {}
     with mapped(path) as data:
-        packets = _read_packets(data, decoder, mavlink.MAVError, wanted, vehicles)
+        at, size, packets = 0, len(data), 0
+        while at + _HEADER + 8 <= size:
+            length, number, system = _packet_at(data, at + _HEADER)
+            if length == 0 or at + _HEADER + length > size:
+                at = _resync(data, at + 1)
+                continue
+            packets += 1
+            if number in wanted:
+                try:
+                    message = decoder.decode(bytearray(data[at + _HEADER : at + _HEADER + length]))
+                except mavlink.MAVError:
+                    at = _resync(data, at + 1)
+                    continue
+                arrival_s = int.from_bytes(data[at : at + _HEADER], "big") * 1e-6
+                if system not in vehicles:
+                    vehicles[system] = _TlogVehicle()
+                vehicles[system].feed(message, arrival_s)
+            at += _HEADER + length
     if not packets:
         raise NotALog("the file holds no MAVLink packet; it is not a tlog")
     return [vehicle.log(path, system) for system, vehicle in sorted(vehicles.items())]
-
-
-def _read_packets(
-    data: mmap.mmap, decoder: Any, failure: type[Exception], wanted: Container[int], vehicles: dict[int, "_TlogVehicle"]
-) -> int:
-    """Pass every wanted packet to its vehicle; returns the number of packets."""
-    at, size, packets = 0, len(data), 0
-    while at + _HEADER + 8 <= size:
-        length, number, system = _packet_at(data, at + _HEADER)
-        if length == 0 or at + _HEADER + length > size:
-            at = _resync(data, at + 1)
-            continue
-        packets += 1
-        if number in wanted:
-            try:
-                message = decoder.decode(bytearray(data[at + _HEADER : at + _HEADER + length]))
-            except failure:
-                at = _resync(data, at + 1)
-                continue
-            arrival_s = int.from_bytes(data[at : at + _HEADER], "big") * 1e-6
-            if system not in vehicles:
-                vehicles[system] = _TlogVehicle()
-            vehicles[system].feed(message, arrival_s)
-        at += _HEADER + length
-    return packets
 
 
 def _packet_at(data: mmap.mmap, at: int) -> tuple[int, int, int]:

@@ -13,8 +13,7 @@ from telemetry.samples.sample import Sample, checked
 from telemetry.samples.timeline import Timeline
 from telemetry.samples.unreadable import Unreadable
 
-Row = dict[str, Any]
-"""One record of a binary log."""
+Row = dict[str, Any]  # one record of a binary log
 
 
 LEAST_STEP_S = 0.04
@@ -27,26 +26,18 @@ class NotALog(Unreadable):
 
 @dataclass(slots=True, kw_only=True)
 class FlightLog:
-    """One vehicle's log.
+    """One vehicle's log."""
 
-    Attributes:
-        path: the file. kind: "tlog", "DataFlash", "ULog", "DroneCAN" and so on. vehicle: "sysid3" or the file's name.
-        samples: poses over UTC, in order. events: exposures, in order.
-        has_gimbal: whether the camera's own attitude was logged.
-        findings: irregularities, for the user.
-        position_sigma_m: last horizontal sigma stated by the autopilot's receiver, None if it stated none.
-        max_gap_s: positions farther apart in time are not interpolated between.
-    """
-
-    path: Path
-    kind: str
-    vehicle: str
-    samples: list[Sample] = field(default_factory=list)
-    events: list[ExposureEvent] = field(default_factory=list)
-    has_gimbal: bool = False
-    findings: list[Finding] = field(default_factory=list)
+    path: Path  # the file
+    kind: str  # "tlog", "DataFlash", "ULog", "DroneCAN" and so on
+    vehicle: str  # "sysid3" or the file's name
+    samples: list[Sample] = field(default_factory=list)  # poses over UTC, in order
+    events: list[ExposureEvent] = field(default_factory=list)  # exposures, in order
+    has_gimbal: bool = False  # whether the camera's own attitude was logged
+    findings: list[Finding] = field(default_factory=list)  # irregularities, for the user
+    # last horizontal sigma stated by the autopilot's receiver, None if it stated none
     position_sigma_m: float | None = None
-    max_gap_s: float = 2.0
+    max_gap_s: float = 2.0  # positions farther apart in time are not interpolated between
 
     def timeline(self) -> Timeline:
         """Its poses, which can be read at any time."""
@@ -55,11 +46,7 @@ class FlightLog:
 
 @contextlib.contextmanager
 def mapped(path: Path) -> Iterator[mmap.mmap]:
-    """A log's bytes without reading them all into memory.
-
-    Raises:
-        OSError: it cannot be read.
-    """
+    """A log's bytes without reading them all into memory. Raises OSError: it cannot be read."""
     with path.open("rb") as handle, mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ) as data:
         yield data
 

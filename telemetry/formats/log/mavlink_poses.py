@@ -24,8 +24,7 @@ _YAW_LOCK, _YAW_IN_VEHICLE, _YAW_IN_EARTH = 16, 32, 64
 _LEAST_HEIGHT_M = 0.5
 _DOWNWARD = 25
 _MOST_H_ACC_MM = 1_000_000
-_LOOKS_DOWN = 0.7
-"""Sine of 45 degrees: no airframe flies that far nose down."""
+_LOOKS_DOWN = 0.7  # sine of 45 degrees: no airframe flies that far nose down
 
 TYPES = frozenset(
     {
@@ -40,44 +39,31 @@ _TIMED = frozenset({"SYSTEM_TIME", "GLOBAL_POSITION_INT", "ATTITUDE", "ATTITUDE_
 """Types by which autopilots tell their time since boot."""
 _OF_AUTOPILOT = _TIMED | {"HOME_POSITION", "GPS_RAW_INT"}
 """Types that count only from the autopilot: a gimbal's ATTITUDE is not the airframe's, and MAVROS sends SYSTEM_TIME."""
-_NO_AUTOPILOT = 8
-"""MAV_AUTOPILOT_INVALID, which HEARTBEATs of everything but autopilots contain."""
+_NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID, which HEARTBEATs of everything but autopilots contain
 _NO_VEHICLES = frozenset({6, 26, 30})
 """MAV_TYPE of ground stations, gimbals and cameras, some of which fill in an autopilot nevertheless."""
 
 
 @dataclass(slots=True)
 class ExposureEvent:
-    """One exposure that an autopilot reported.
+    """One exposure that an autopilot reported."""
 
-    Attributes:
-        time_s: UTC epoch seconds, None where only the time since boot is known.
-        boot_s: seconds since boot, None where unknown.
-        number: image index as the autopilot counts. sample: the pose it reported. kind: name of the message.
-    """
-
-    time_s: float | None
-    boot_s: float | None
-    number: int | None
-    sample: Sample
-    kind: str
+    time_s: float | None  # UTC epoch seconds, None where only the time since boot is known
+    boot_s: float | None  # seconds since boot, None where unknown
+    number: int | None  # image index as the autopilot counts
+    sample: Sample  # the pose it reported
+    kind: str  # name of the message
 
 
 @dataclass(slots=True, kw_only=True)
 class MavlinkPoses:
-    """Turns one vehicle's messages into samples and camera events.
+    """Turns one vehicle's messages into samples and camera events."""
 
-    Attributes:
-        heading_deg: of the airframe, latest. has_gimbal: whether a gimbal reported.
-        home_altitude_m: altitude of home above sea level.
-        position_sigma_m: horizontal sigma stated by the receiver, None if it states none. clocks: of all components.
-    """
-
-    heading_deg: float | None = None
-    has_gimbal: bool = False
-    home_altitude_m: float | None = None
-    position_sigma_m: float | None = None
-    clocks: SenderClocks = field(default_factory=SenderClocks, repr=False)
+    heading_deg: float | None = None  # of the airframe, latest
+    has_gimbal: bool = False  # whether a gimbal reported
+    home_altitude_m: float | None = None  # altitude of home above sea level
+    position_sigma_m: float | None = None  # horizontal sigma stated by the receiver, None if it states none
+    clocks: SenderClocks = field(default_factory=SenderClocks, repr=False)  # of all components
     _arrival_s: float | None = field(default=None, repr=False)
 
     def feed(self, message: Any, arrival_s: float | None = None) -> Sample | ExposureEvent | None:
@@ -198,14 +184,9 @@ class MavlinkPoses:
 
     def _feedback(self, m: Any) -> ExposureEvent:
         sample = Sample(
-            lat_deg=m.lat * 1e-7,
-            lon_deg=m.lng * 1e-7,
-            altitude_m=m.alt_msl,
-            height_m=m.alt_rel,
-            flight_yaw_deg=m.yaw,
-            flight_pitch_deg=m.pitch,
-            flight_roll_deg=m.roll,
-        )
+            lat_deg=m.lat * 1e-7, lon_deg=m.lng * 1e-7, altitude_m=m.alt_msl, height_m=m.alt_rel, flight_yaw_deg=m.yaw,
+            flight_pitch_deg=m.pitch, flight_roll_deg=m.roll,
+        )  # fmt: skip
         return self._event(m, m.time_usec * 1e-6, m.img_idx, sample)
 
     def _captured(self, m: Any) -> ExposureEvent | None:

@@ -28,11 +28,7 @@ _SENTENCE = re.compile(r"\$([A-Z]{2})(RMC|GGA|GNS|ZDA),([^*$\r\n]*)(?:\*([0-9A-F
 
 
 def read_track(path: Path) -> FlightLog:
-    """Read a GPX file or NMEA sentences.
-
-    Raises:
-        OSError: it cannot be read. NotALog: it holds no dated position.
-    """
+    """Read a GPX file or NMEA sentences. Raises OSError: it cannot be read; NotALog: it holds no dated position."""
     with path.open("rb") as handle:
         text = handle.read(MOST_TEXT_BYTES).decode("utf-8-sig", "replace")
     gpx = path.suffix.lower() == ".gpx"
@@ -86,7 +82,8 @@ def _nmea(log: FlightLog, text: str) -> int:
         stated = _date_s(words, kind)
         day_s = day_s if stated is None else stated
         at = {"RMC": 2, "GGA": 1, "GNS": 1}.get(kind)
-        if at is None or not _is_valid(kind, words):
+        fixed = words[1] == "A" if kind == "RMC" else words[5] not in ("", "0", "N", "NN", "NNN")
+        if at is None or not fixed:
             continue
         lat, lon = _degrees(words[at], words[at + 1]), _degrees(words[at + 2], words[at + 3])
         if lat is None or lon is None:
@@ -105,7 +102,10 @@ def _nmea(log: FlightLog, text: str) -> int:
 def _sentences(log: FlightLog, text: str) -> Iterator[tuple[str, list[str]]]:
     """Kinds and words of the sentences whose checksums are right; of all, if none is."""
     found = _SENTENCE.findall(text)
-    right = [not given or int(given, 16) == _checksum(f"{t}{k},{body}") for t, k, body, given in found]
+    right = [
+        not given or int(given, 16) == reduce(xor, f"{t}{k},{body}".encode("latin-1", "replace"), 0)
+        for t, k, body, given in found
+    ]
     if not any(right) and found:
         log.findings.append(Finding("checksum-wrong", f"no checksum of {log.path.name} is right; they are not heeded"))
     elif not all(right):
@@ -114,15 +114,6 @@ def _sentences(log: FlightLog, text: str) -> Iterator[tuple[str, list[str]]]:
     for (_, kind, body, _), sound in zip(found, right, strict=True):
         if sound or not any(right):
             yield kind, [*body.split(","), *[""] * 12]
-
-
-def _checksum(sentence: str) -> int:
-    return reduce(xor, sentence.encode("latin-1", "replace"), 0)
-
-
-def _is_valid(kind: str, words: list[str]) -> bool:
-    """Whether the receiver had a fix."""
-    return words[1] == "A" if kind == "RMC" else words[5] not in ("", "0", "N", "NN", "NNN")
 
 
 def _clock_s(word: str) -> float | None:

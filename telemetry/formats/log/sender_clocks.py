@@ -10,8 +10,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Final
 
-AUTOPILOT: Final = 1
-"""MAV_COMP_ID_AUTOPILOT1. Component 0, of messages that came over no link, counts as it."""
+AUTOPILOT: Final = 1  # MAV_COMP_ID_AUTOPILOT1. Component 0, of messages that came over no link, counts as it.
 
 _ANY, _ID_ONLY, _POSITIONED, _FLIES, _BY_ID = range(1, 6)
 """What makes a component the autopilot, from weak to strong: nothing better was heard; its id is an autopilot's; it
@@ -21,10 +20,8 @@ _SAME_CLOCK_S = 0.25
 """A component whose clock differs by less keeps the autopilot's: arrivals of a radio link tell no better."""
 _CLOCK_STEP_S = 2.0
 """A change of the difference beyond this is a restart of the component, or one message that came late."""
-_SMOOTHED = 50
-"""Messages over which the difference is averaged: quartz clocks drift by milliseconds in that time."""
-_REMEMBERED = 1000
-"""Pictures whose numbers and times are remembered, to tell old ones from those of a restarted camera."""
+_SMOOTHED = 50  # messages over which the difference is averaged: quartz clocks drift by milliseconds in that time
+_REMEMBERED = 1000  # pictures whose numbers and times are remembered, to tell old ones from those of a restarted camera
 
 
 @dataclass(slots=True)
@@ -88,24 +85,19 @@ class _Pictures:
 
 @dataclass(slots=True, kw_only=True)
 class SenderClocks:
-    """Converts the times since boot of all components of a vehicle to its autopilot's.
+    """Converts the times since boot of all components of a vehicle to its autopilot's."""
 
-    Attributes:
-        boot_s: the autopilot's latest time since boot. utc_minus_boot_s: UTC less that, None while unknown.
-        reboots: number of times that it went back.
-        bases: number of times that times since boot began to count from another moment: at a reboot, and where
-            the autopilot turned out to be another component than was thought.
-        fliers: components whose HEARTBEAT is an autopilot's. One is chosen once it sends more than that.
-    """
-
-    boot_s: float = 0.0
-    utc_minus_boot_s: float | None = None
-    reboots: int = 0
+    boot_s: float = 0.0  # the autopilot's latest time since boot
+    utc_minus_boot_s: float | None = None  # UTC less that, None while unknown
+    reboots: int = 0  # number of times that it went back
+    # number of times that times since boot began to count from another moment: at a reboot, and where the autopilot
+    # turned out to be another component than was thought
     bases: int = 0
     _autopilot: int = field(default=0, repr=False)
     _rank: int = field(default=0, repr=False)
     _heard: bool = field(default=False, repr=False)
     _arrival_s: float | None = field(default=None, repr=False)
+    # components whose HEARTBEAT is an autopilot's. One is chosen once it sends more than that
     fliers: set[int] = field(default_factory=set, repr=False)
     _positioned: list[int] = field(default_factory=list, repr=False)
     _others: dict[int, _Difference] = field(default_factory=dict, repr=False)
@@ -188,8 +180,7 @@ class SenderClocks:
         It tells the difference of the clocks only as long as nothing is known that the sender sends at once. The sender
         was restarted if its time goes back and the picture is none of before by its number.
 
-        Args:
-            number: the picture's. kind: of the message; each has its own numbers.
+        number: the picture's. kind: of the message; each has its own numbers.
         """
         if boot_s > 0.0 and component == self._autopilot:
             return boot_s

@@ -36,8 +36,7 @@ _FIX_3D = 3
 def read_ulog(path: Path) -> FlightLog:
     """Read a ULog; a truncated one as far as it goes.
 
-    Raises:
-        OSError: it cannot be read. NotALog: it is not a ULog, or nothing in it can be dated.
+    Raises OSError: it cannot be read; NotALog: it is not a ULog, or nothing in it can be dated.
     """
     with mapped(path) as data:
         if data[:7] != _MAGIC:

@@ -29,8 +29,7 @@ DATE_ORIGINAL, OFFSET_TIME, OFFSET_ORIGINAL, SUBSEC, SUBSEC_ORIGINAL = 0x9003, 0
 MAKER_NOTE, FOCAL_MM, FOCAL_PLANE_X, FOCAL_PLANE_UNIT = 0x927C, 0x920A, 0xA20E, 0xA210
 PIXEL_X, FOCAL_35MM, DIGITAL_ZOOM = 0xA002, 0xA405, 0xA404
 
-_WRITTEN_CHARACTERS = 19
-"""Length of a time in EXIF, without the zero after it."""
+_WRITTEN_CHARACTERS = 19  # length of a time in EXIF, without the zero after it
 
 _LARGE_MAIN = frozenset({XMP})
 _LARGE_EXIF = frozenset({MAKER_NOTE})
@@ -41,15 +40,11 @@ _MOST_NOTE_ENTRIES = 256
 
 @dataclass(slots=True)
 class Exif:
-    """The tags of the three directories that are used, by number.
+    """The tags of the three directories that are used, by number."""
 
-    Attributes:
-        main: IFD0. exif: the EXIF IFD. gps: the GPS IFD.
-    """
-
-    main: Tags = field(default_factory=dict)
-    exif: Tags = field(default_factory=dict)
-    gps: Tags = field(default_factory=dict)
+    main: Tags = field(default_factory=dict)  # IFD0
+    exif: Tags = field(default_factory=dict)  # the EXIF IFD
+    gps: Tags = field(default_factory=dict)  # the GPS IFD
 
 
 def parse_tiff(data: Buffer) -> Exif:
@@ -204,8 +199,7 @@ def exposure_time(exif: Exif) -> tuple[float, str] | None:
 
 
 _DAY_S, _QUARTER_S, _MOST_LAG_S = 86_400.0, 900.0, 120.0
-_WEST, _EAST = -11 * 4, 14 * 4
-"""The time zones in which people live, in quarters of an hour east of UTC."""
+_WEST, _EAST = -11 * 4, 14 * 4  # the time zones in which people live, in quarters of an hour east of UTC
 _ROLLOVER_DAYS = 1024 * 7
 """A receiver that counts weeks with ten bits is early by so much when they overflow (IS-GPS-200, 20.3.3.3.1.1)."""
 _YEAR_DAYS = 366
@@ -222,9 +216,7 @@ def _by_both(clock: float, stamp: float) -> tuple[float, str] | None:
     - The stamp is more than a year early, but not so: the receiver had no fix.
     - Otherwise the clock was set wrongly, or never, as clocks start in a past year. The stamp is right.
 
-    Args:
-        clock: the camera's time as if it were UTC, epoch seconds.
-        stamp: GPSDateStamp and GPSTimeStamp, epoch seconds.
+    clock: the camera's time as if it were UTC, epoch seconds. stamp: GPSDateStamp and GPSTimeStamp, epoch seconds.
     """
     days = _days_early(clock - stamp)
     if days > _YEAR_DAYS:
@@ -274,10 +266,6 @@ def parse_dji(note: bytes) -> Sample | None:
         return None
     pitch, yaw, roll, camera_pitch, camera_yaw, camera_roll = (floats.get(tag) for tag in range(6, 12))
     return Sample(
-        flight_pitch_deg=pitch,
-        flight_yaw_deg=yaw,
-        flight_roll_deg=roll,
-        pitch_deg=camera_pitch,
-        yaw_deg=camera_yaw,
+        flight_pitch_deg=pitch, flight_yaw_deg=yaw, flight_roll_deg=roll, pitch_deg=camera_pitch, yaw_deg=camera_yaw,
         roll_deg=camera_roll,
-    )
+    )  # fmt: skip

@@ -28,23 +28,15 @@ class NotAPicture(Unreadable):
 
 @dataclass(slots=True, kw_only=True)
 class Container:
-    """Kind, size and metadata of a picture file.
+    """Kind, size and metadata of a picture file."""
 
-    Attributes:
-        kind: "jpeg", "png", "webp", "tiff" or "bmp".
-        width: columns as stored. height: rows.
-        exif: its EXIF tags. xmp: its XMP packet, b"" if none.
-        georeferenced: True for a GeoTIFF, which is a map, not a picture of a camera.
-        raw: True for a DNG, which has to be developed first.
-    """
-
-    kind: str
-    width: int
-    height: int
-    exif: exif.Exif
-    xmp: bytes = b""
-    georeferenced: bool = False
-    raw: bool = False
+    kind: str  # "jpeg", "png", "webp", "tiff" or "bmp"
+    width: int  # columns as stored
+    height: int  # rows
+    exif: exif.Exif  # its EXIF tags
+    xmp: bytes = b""  # its XMP packet, b"" if none
+    georeferenced: bool = False  # True for a GeoTIFF, which is a map, not a picture of a camera
+    raw: bool = False  # True for a DNG, which has to be developed first
 
 
 def read_container(path: Path) -> Container:
@@ -222,11 +214,6 @@ def _tiff(parts: Parts) -> Container:
     )
     packet = tags.main.get(exif.XMP)
     return Container(
-        kind="tiff",
-        width=int(width),
-        height=int(height),
-        exif=tags,
-        xmp=packet if isinstance(packet, bytes) else b"",
-        georeferenced=geo,
-        raw=exif.DNG_VERSION in tags.main,
-    )
+        kind="tiff", width=int(width), height=int(height), exif=tags, xmp=packet if isinstance(packet, bytes) else b"",
+        georeferenced=geo, raw=exif.DNG_VERSION in tags.main,
+    )  # fmt: skip

@@ -69,8 +69,7 @@ def coordinate_deg(cell: str, axis: str, factor: float = 1.0) -> float | None:
     Read are decimal degrees, degrees and minutes, and degrees, minutes and seconds, with marks (47 deg 30' 0.0",
     47°30.5', 47:30:00) or blanks between, with a sign, or with a hemisphere (N, south) before or after.
 
-    Args:
-        axis: "NS" for a latitude, "EW" for a longitude. factor: degrees in the unit of decimal numbers.
+    axis: "NS" for a latitude, "EW" for a longitude. factor: degrees in the unit of decimal numbers.
     """
     cell = _plain(cell)
     written = _degrees(cell, factor)

@@ -32,11 +32,7 @@ def is_geo_txt(path: Path) -> bool:
 
 
 def read_geo_txt(path: Path) -> PoseTable:
-    """Read an ODM geo.txt.
-
-    Raises:
-        InputError: no projection in its first line, or no line that can be read.
-    """
+    """Read an ODM geo.txt. Raises InputError: no projection in its first line, or no line that can be read."""
     lines = [line.strip() for line in read_text(path).splitlines()]
     lines = [line for line in lines if line and not line.startswith("#")]
     projection = projection_of(lines[0]) if lines else None
@@ -66,8 +62,7 @@ def read_geo_txt(path: Path) -> PoseTable:
 def to_geographic(table: PoseTable, projection: str, path: Path) -> None:
     """Turn coordinates of a projection (x in lon_deg, y in lat_deg) into degrees; impossible ones become None.
 
-    Raises:
-        InputError: the projection is not understood or has no datum, or the coordinates are exchanged.
+    Raises InputError: the projection is not understood or has no datum, or the coordinates are exchanged.
     """
     x_y = [[math.nan if v is None else v for v in (r.lon_deg, r.lat_deg)] for r in table.values()]
     x, y = [x for x, _ in x_y], [y for _, y in x_y]

@@ -74,17 +74,11 @@ _PIX4D_COLUMNS = {
 
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """How the lines of a table are written.
+    """How the lines of a table are written."""
 
-    Attributes:
-        separator: between cells; a blank stands for any number of blanks.
-        keys: field of each column, "" for one that is not used.
-        factors: metres or degrees in one unit of each column.
-    """
-
-    separator: str
-    keys: Sequence[str]
-    factors: Sequence[float]
+    separator: str  # between cells; a blank stands for any number of blanks
+    keys: Sequence[str]  # field of each column, "" for one that is not used
+    factors: Sequence[float]  # metres or degrees in one unit of each column
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,8 +93,7 @@ class _Line:
 def read_pose_csv(path: Path) -> PoseTable | None:
     """Read a table of poses; None if the file is some other text.
 
-    Raises:
-        InputError: it is a table of poses that cannot be read: no projection, too large.
+    Raises InputError: it is a table of poses that cannot be read: no projection, too large.
     """
     # Most tables next to pictures are not tables of poses, and may be large.
     head = decoded(beginning(path, _HEAD_BYTES)).splitlines()
@@ -167,9 +160,15 @@ def _read(path: Path, header_at: int, layout: _Layout, title: str) -> PoseTable:
         for cells in rows:
             found.append(_line(table, layout, cells))
     named = [line for line in found if line is not None]
-    marks = layout.separator != "," and not any(map(_has_point, named))
+    numbers = (cell for line in named for key, cell in line.cells.items() if key in _NUMBERS)
+    # The point in 1.047,5 divides thousands.
+    marks = layout.separator != "," and not any(_POINT.search(cell) and not _COMMA.search(cell) for cell in numbers)
     for line in named:
-        _add_row(table, _with_points(line, marks, layout.separator))
+        replaced = _NUMBERS if marks else frozenset()
+        if layout.separator != ",":  # the comma before fractions of a second says nothing about other numbers
+            replaced = replaced | {"time"}
+        pointed = {key: _COMMA.sub(".", cell) if key in replaced else cell for key, cell in line.cells.items()}
+        _add_row(table, _Line(line.name, pointed, line.factors))
     unclear = table.useless
     if "lat_deg" not in layout.keys:
         to_geographic(table, _projection(path, lines[: header_at + 1], table), path)
@@ -246,25 +245,6 @@ def _is_shifted(separator: str, found: Mapping[str, str], extra: Sequence[str]) 
     if separator == " ":
         return more and any(_WHOLE.fullmatch(found.get(key, "")) for key in ("lat_deg", "lon_deg"))
     return more and separator == ","
-
-
-def _has_point(line: _Line) -> bool:
-    """Whether a number of a line has a decimal point; the point in 1.047,5 divides thousands."""
-    return any(_POINT.search(cell) and not _COMMA.search(cell) for key, cell in line.cells.items() if key in _NUMBERS)
-
-
-def _with_points(line: _Line, marks: bool, separator: str) -> _Line:
-    """A line with points for decimal commas.
-
-    Args:
-        line: as written. marks: the commas in the table's numbers are decimal marks. separator: between cells.
-    """
-    replaced = _NUMBERS if marks else frozenset()
-    if separator != ",":  # the comma before fractions of a second says nothing about other numbers
-        replaced = replaced | {"time"}
-    return _Line(
-        line.name, {k: _COMMA.sub(".", c) if k in replaced else c for k, c in line.cells.items()}, line.factors
-    )
 
 
 def _add_row(table: PoseTable, line: _Line) -> None:

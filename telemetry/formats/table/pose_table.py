@@ -11,23 +11,16 @@ from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
 from telemetry.samples.sample import Sample
 from telemetry.samples.unreadable import MOST_TEXT_BYTES
 
-_MOST_FOLDERS = 64
-"""Folders of a path that may be left out: more are no path."""
+_MOST_FOLDERS = 64  # folders of a path that may be left out: more are no path
 
 
 class PoseTable(dict[str, Sample]):
-    """Lower-case picture name (or relative path with forward slashes) -> row.
+    """Lower-case picture name (or relative path with forward slashes) -> row."""
 
-    Attributes:
-        useless: number of lines that name a picture without a valid position.
-        refused: number of cells that were not understood; first_refused: the first of them.
-        doubt: what is uncertain about the datum of its positions, "" if nothing is.
-    """
-
-    useless: int = 0
-    refused: int = 0
-    first_refused: str = ""
-    doubt: str = ""
+    useless: int = 0  # number of lines that name a picture without a valid position
+    refused: int = 0  # number of cells that were not understood
+    first_refused: str = ""  # the first of them
+    doubt: str = ""  # what is uncertain about the datum of its positions, "" if nothing is
 
     def refuse(self, cell: str) -> None:
         """Count a cell that is not understood."""
@@ -62,8 +55,7 @@ def leave_out_folder(table: PoseTable, pictures: Collection[str]) -> str:
 
     Args:
         table: no name of which is a picture's. Changed where leaving out the first folders that all rows share makes
-            most of its paths those of pictures.
-        pictures: paths relative to the table's folder.
+            most of its paths those of pictures. pictures: paths relative to the table's folder.
 
     Returns:
         the folders that were left out, with a slash at the end; "" if nothing matched.
@@ -85,8 +77,7 @@ def leave_out_folder(table: PoseTable, pictures: Collection[str]) -> str:
 def take_base_names(table: PoseTable, pictures: Collection[str]) -> int:
     """Rename rows to the only picture of their file name, where no other row has it either; returns how many.
 
-    Args:
-        table: no name of which is a picture's. pictures: paths relative to the table's folder.
+    table: no name of which is a picture's. pictures: paths relative to the table's folder.
     """
     places: dict[str, list[str]] = {}
     for picture in pictures:
@@ -122,11 +113,7 @@ def decoded(data: bytes) -> str:
 
 
 def read_text(path: Path) -> str:
-    """A table's text.
-
-    Raises:
-        InputError: it is too large, or cannot be read.
-    """
+    """A table's text. Raises InputError: it is too large, or cannot be read."""
     try:
         if path.stat().st_size > MOST_TEXT_BYTES:
             raise InputError(f"{path.name} is larger than {MOST_TEXT_BYTES >> 20} MB; split it")

@@ -16,14 +16,10 @@ MAX_PAYLOAD = 1 << 16
 
 @dataclass(frozen=True, slots=True)
 class StreamFormat:
-    """Framing of NAL units in a packet.
+    """Framing of NAL units in a packet."""
 
-    Attributes:
-        codec: "h264" or "hevc". prefix: bytes of the length before each unit, 0 for Annex B start codes.
-    """
-
-    codec: Codec
-    prefix: int = 0
+    codec: Codec  # "h264" or "hevc"
+    prefix: int = 0  # bytes of the length before each unit, 0 for Annex B start codes
 
     @classmethod
     def of(cls, codec: str, extradata: bytes | None) -> "StreamFormat | None":

@@ -102,17 +102,12 @@ def read_djmd(data: bytes) -> Sample | None:
     unit = 1.0 if coordinates.get(1) else 180.0 / math.pi
     gimbal = _inner(body, 4, 3) if base == 3 else {}
     sample = Sample(
-        lat_deg=_scaled(coordinates, 2, unit),
-        lon_deg=_scaled(coordinates, 3, unit),
-        altitude_m=_scaled(place, 2, 1e-3),
-        height_m=_scaled(_inner(block, 5), 1, 1e-3) if position_at == 4 else None,
-        flight_roll_deg=_scaled(airframe, 1, 0.1),
-        flight_pitch_deg=_scaled(airframe, 2, 0.1),
-        flight_yaw_deg=_scaled(airframe, 3, 0.1),
-        pitch_deg=_scaled(gimbal, 1, 0.1),
-        roll_deg=_scaled(gimbal, 2, 0.1),
+        lat_deg=_scaled(coordinates, 2, unit), lon_deg=_scaled(coordinates, 3, unit),
+        altitude_m=_scaled(place, 2, 1e-3), height_m=_scaled(_inner(block, 5), 1, 1e-3) if position_at == 4 else None,
+        flight_roll_deg=_scaled(airframe, 1, 0.1), flight_pitch_deg=_scaled(airframe, 2, 0.1),
+        flight_yaw_deg=_scaled(airframe, 3, 0.1), pitch_deg=_scaled(gimbal, 1, 0.1), roll_deg=_scaled(gimbal, 2, 0.1),
         yaw_deg=_scaled(gimbal, 3, 0.1),
-    )
+    )  # fmt: skip
     # Protobuf omits zeros: where a gimbal or an airframe is present, a missing angle is zero.
     for name in (*(CAMERA_ANGLES if gimbal else ()), *(FLIGHT_ANGLES if airframe else ())):
         setattr(sample, name, getattr(sample, name) or 0.0)

@@ -39,8 +39,10 @@ def read_gpmf(data: bytes) -> list[Sample]:
         scale = _scale(entries.get(b"SCAL"))
         if b"GPS9" in entries:
             samples += _gps9(entries[b"GPS9"], scale)
-        elif b"GPS5" in entries and not _without_fix(entries.get(b"GPSF")):
-            samples += _gps5(entries[b"GPS5"], scale, _utc(entries.get(b"GPSU")))
+        elif b"GPS5" in entries:
+            fix = entries[b"GPSF"].value[:4] if b"GPSF" in entries else b""
+            if len(fix) < 4 or int.from_bytes(fix, "big") >= 2:
+                samples += _gps5(entries[b"GPS5"], scale, _utc(entries.get(b"GPSU")))
     return samples
 
 
@@ -73,10 +75,6 @@ def _scale(entry: _GpmfEntry | None) -> list[float]:
     count = len(entry.value) // width
     code = "i" if width == 4 else "h"
     return [float(value) or 1.0 for value in struct.unpack_from(f">{count}{code}", entry.value)] or [1.0]
-
-
-def _without_fix(entry: _GpmfEntry | None) -> bool:
-    return entry is not None and len(entry.value) >= 4 and int.from_bytes(entry.value[:4], "big") < 2
 
 
 def _utc(entry: _GpmfEntry | None) -> float | None:

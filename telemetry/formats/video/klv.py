@@ -22,17 +22,12 @@ MAX_PACKET = 1 << 20
 
 @dataclass(slots=True)
 class KlvPacket:
-    """One KLV packet.
+    """One KLV packet."""
 
-    Attributes:
-        kind: "ST 0601" or "EG 0104". sample: its pose, None if it has none or is damaged.
-        error: why it was refused, "" if it was not. values: the values read, by name.
-    """
-
-    kind: str
-    sample: Sample | None
-    error: str = ""
-    values: dict[str, float | str] = field(default_factory=dict)
+    kind: str  # "ST 0601" or "EG 0104"
+    sample: Sample | None  # its pose, None if it has none or is damaged
+    error: str = ""  # why it was refused, "" if it was not
+    values: dict[str, float | str] = field(default_factory=dict)  # the values read, by name
 
 
 def packets(data: bytes) -> Iterator[KlvPacket]:

@@ -60,17 +60,12 @@ _FIELD = re.compile(r"(\w+)(?:\*([+-]?[\d.]+(?:e[+-]?\d+)?))?([+-][\d.]+)?", re.
 
 @dataclass(frozen=True, slots=True)
 class Decoder:
-    """One kind of SEI payload.
+    """One kind of SEI payload."""
 
-    Attributes:
-        name: shown as the origin of a picture's fields. payload_type: SEI payload type.
-        uuid: the 16 bytes that lead a payload of type 5, None for other types (or for any UUID).
-        decode: from the payload (after the UUID) to a sample, None where it is not understood.
-    """
-
-    name: str
-    payload_type: int
-    uuid: bytes | None
+    name: str  # shown as the origin of a picture's fields
+    payload_type: int  # SEI payload type
+    uuid: bytes | None  # the 16 bytes that lead a payload of type 5, None for other types (or for any UUID)
+    # from the payload (after the UUID) to a sample, None where it is not understood
     decode: Callable[[bytes], Sample | None]
 
 
@@ -222,14 +217,9 @@ def _decode_gimbal_camera(body: bytes) -> Sample | None:
     if 1 <= month <= 12 and 1 <= day <= 31 and 2000 <= year < 2200 and math.isfinite(second):
         time_s = calendar.timegm((year, month, day, hour, minute, 0, 0, 0, 0)) + second
     return Sample(
-        time_s=time_s,
-        lat_deg=lat,
-        lon_deg=lon,
-        altitude_m=altitude,
-        yaw_deg=yaw / 100.0,
-        pitch_deg=pitch / 100.0,
+        time_s=time_s, lat_deg=lat, lon_deg=lon, altitude_m=altitude, yaw_deg=yaw / 100.0, pitch_deg=pitch / 100.0,
         roll_deg=roll / 100.0,
-    )
+    )  # fmt: skip
 
 
 def _decode_dji(body: bytes) -> Sample | None:
@@ -352,8 +342,7 @@ def read_sei_layout(path: Path) -> Decoder:
     `flight_yaw_deg`, `fov_deg`, `sigma_m`, `time_s`), each with a factor and an offset if its unit is another one
     ("pitch_deg*0.01-90"); "" leaves a value out. The payload may be longer than the struct.
 
-    Raises:
-        InputError: the file cannot be read, or does not describe a message; names the wrong entry.
+    Raises InputError: the file cannot be read, or does not describe a message; names the wrong entry.
     """
     try:
         entries = tomllib.loads(path.read_text("utf-8"))

@@ -61,17 +61,12 @@ class Cue:
 
 @dataclass(slots=True)
 class Subtitles:
-    """The content of an SRT file.
+    """The content of an SRT file."""
 
-    Attributes:
-        cues: in order of the file. latitude_first: order of the GPS tuples, None where there are none.
-        notes: irregularities by code, one sentence each.
-        joints_s: times at which the subtitles of another recording begin, where the file joins several.
-    """
-
-    cues: list[Cue] = field(default_factory=list)
-    latitude_first: bool | None = None
-    notes: dict[str, str] = field(default_factory=dict)
+    cues: list[Cue] = field(default_factory=list)  # in order of the file
+    latitude_first: bool | None = None  # order of the GPS tuples, None where there are none
+    notes: dict[str, str] = field(default_factory=dict)  # irregularities by code, one sentence each
+    # times at which the subtitles of another recording begin, where the file joins several
     joints_s: list[float] = field(default_factory=list)
 
     @property
@@ -81,11 +76,7 @@ class Subtitles:
 
 
 def read_srt(path: Path) -> Subtitles:
-    """Read an SRT file; blocks that are not understood are left out.
-
-    Raises:
-        OSError: the file cannot be read.
-    """
+    """Read an SRT file; blocks that are not understood are left out. Raises OSError: the file cannot be read."""
     with path.open("rb") as handle:
         data = handle.read(MOST_TEXT_BYTES)
     encoding = "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"

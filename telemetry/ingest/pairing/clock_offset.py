@@ -16,10 +16,8 @@ _QUARTER_S = 900.0
 _HALF_HOURS = (-9.5, -4.5, -3.5, -2.5, 3.5, 4.5, 5.5, 5.75, 6.5, 8.5, 8.75, 9.5, 10.5, 11.5, 12.75, 13.75)
 ZONES_S = tuple(3600.0 * hours for hours in sorted([*range(-12, 15), *_HALF_HOURS]))
 """Offsets of local times from UTC that were in use anywhere from 2010 on, seconds (IANA time zone database)."""
-SPAN_MARGIN_S = 2.0
-"""Photos may lie so far outside a log's span, seconds: times are in whole seconds."""
-_MOVED_M = 2.0
-"""A vehicle moved that is farther away at the next photo, metres (chosen: receivers at rest wander less)."""
+SPAN_MARGIN_S = 2.0  # photos may lie so far outside a log's span, seconds: times are in whole seconds
+_MOVED_M = 2.0  # A vehicle moved that is farther away at the next photo, metres (chosen: receivers at rest wander less)
 _LEAST_MOVED = 0.8
 """Zones under which a vehicle moved less often, by this share of the most, are not the photos' (chosen)."""
 

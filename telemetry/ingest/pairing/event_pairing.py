@@ -27,27 +27,19 @@ LEAST_JUMP_S: Final = 0.6  # clocks of two parts that differ by more than this a
 
 @dataclass(slots=True, kw_only=True)
 class Pairing:
-    """Which photo belongs to which event.
+    """Which photo belongs to which event."""
 
-    Attributes:
-        pairs: (photo, event) indices, photos increasing.
-        doubtful: photos whose pairing the times leave open -> possible events.
-        open: photos that have an event by the likeliest clock, and none by another one that is possible, too.
-        offset_s: photo clock minus event clock, None if times were not used.
-        residual_s: median distance of paired times after offset and drift.
-        ambiguous: True if less than half of the pairs are decided. how: "time", "number" or "order".
-        by_pictures: whether the pictures' motion was used, too.
-        jumps: for each time that the camera's clock was set, the first photo after it and by how many seconds.
-    """
-
-    pairs: list[tuple[int, int]] = field(default_factory=list)
+    pairs: list[tuple[int, int]] = field(default_factory=list)  # (photo, event) indices, photos increasing
+    # photos whose pairing the times leave open -> possible events
     doubtful: dict[int, list[int]] = field(default_factory=dict)
+    # photos that have an event by the likeliest clock, and none by another one that is possible, too
     open: set[int] = field(default_factory=set)
-    offset_s: float | None = None
-    residual_s: float = 0.0
-    ambiguous: bool = False
-    how: str = "time"
-    by_pictures: bool = False
+    offset_s: float | None = None  # photo clock minus event clock, None if times were not used
+    residual_s: float = 0.0  # median distance of paired times after offset and drift
+    ambiguous: bool = False  # True if less than half of the pairs are decided
+    how: str = "time"  # "time", "number" or "order"
+    by_pictures: bool = False  # whether the pictures' motion was used, too
+    # for each time that the camera's clock was set, the first photo after it and by how many seconds
     jumps: list[tuple[int, float]] = field(default_factory=list)
 
 
@@ -232,15 +224,11 @@ def _parts_between_jumps(photos: Array, events: Array) -> list[slice]:
     starts = [0]
     for before, after in pairwise(clocks):
         if abs(after - before) > allowed:
-            starts.append(_first_after(photos, events, before, after, starts[-1]))
+            start = starts[-1]  # under the clock of their part photos are nearest to events
+            far = SAME_EXPOSURE_SHARE * float(np.median(np.diff(events)))
+            own, other = (np.minimum(_apart(photos[start:] - clock, events), far) for clock in (before, after))
+            starts.append(start + int(np.argmin(np.concatenate([[0.0], np.cumsum(own - other)]))))
     return [slice(a, b) for a, b in zip(starts, [*starts[1:], count], strict=True) if b > a]
-
-
-def _first_after(photos: Array, events: Array, before: float, after: float, start: int) -> int:
-    """Index of the first photo of the later clock: under the clock of their part photos are nearest to events."""
-    far = SAME_EXPOSURE_SHARE * float(np.median(np.diff(events)))
-    own, other = (np.minimum(_apart(photos[start:] - clock, events), far) for clock in (before, after))
-    return start + int(np.argmin(np.concatenate([[0.0], np.cumsum(own - other)])))
 
 
 def _apart(times: Array, events: Array) -> Array:

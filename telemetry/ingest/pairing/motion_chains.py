@@ -15,7 +15,7 @@ from orthoswarm.model.arrays import Array, Indices
 from telemetry.formats.log.log_data import FlightLog
 from telemetry.formats.log.mavlink_poses import fixed_camera
 from telemetry.photos.photo_tags import Photo
-from telemetry.photos.picture_motion import PictureFile, shifts_px
+from telemetry.photos.picture_motion import shifts_px
 from telemetry.samples.course import ground_track
 from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
@@ -31,15 +31,11 @@ _MOST_TILT_DEG: Final = 60.0  # pictures that look farther from nadir than this 
 
 @dataclass(frozen=True, slots=True)
 class PictureMotion:
-    """What the pictures show of the way; they are read only where times do not decide.
+    """What the pictures show of the way; they are read only where times do not decide."""
 
-    Attributes:
-        path_m: (M,) way along the track to each event, of what the camera looks at, metres.
-        shifts_px: for photos (indices, in order of time) the pixels that the ground moves from each to the next, NaN
-            where the two do not match.
-    """
-
-    path_m: Array
+    path_m: Array  # (M,) way along the track to each event, of what the camera looks at, metres
+    # for photos (indices, in order of time) the pixels that the ground moves from each to the next, NaN where the two
+    # do not match
     shifts_px: Callable[[Sequence[int]], Array]
 
     def subset(self, photos: Sequence[int], events: Sequence[int]) -> "PictureMotion":
@@ -49,27 +45,19 @@ class PictureMotion:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Chains:
-    """Photos by chain; a photo without a measured step is a chain of its own without any evidence.
+    """Photos by chain; a photo without a measured step is a chain of its own without any evidence."""
 
-    Attributes:
-        number: (N,) of each photo's chain. along_px: (N,) way from the middle of its chain.
-        path_m: (K,) way of each single event. e: (K,) times of the events. p: (N,) middle of each photo's interval.
-        resolution_s: of the photos' clock. metres_a_pixel, sigma_m: of a photo's way, one sigma.
-        step_m: usual way between events.
-        phases_s, scales: (C,) hypotheses.
-    """
-
-    number: Indices
-    along_px: Array
-    path_m: Array
-    e: Array
-    p: Array
-    resolution_s: float
-    metres_a_pixel: float
-    sigma_m: float
-    step_m: float
-    phases_s: Array
-    scales: Array
+    number: Indices  # (N,) of each photo's chain
+    along_px: Array  # (N,) way from the middle of its chain
+    path_m: Array  # (K,) way of each single event
+    e: Array  # (K,) times of the events
+    p: Array  # (N,) middle of each photo's interval
+    resolution_s: float  # of the photos' clock
+    metres_a_pixel: float  # of a photo's way, one sigma
+    sigma_m: float  # of a photo's way, one sigma
+    step_m: float  # usual way between events
+    phases_s: Array  # (C,) hypotheses
+    scales: Array  # (C,) hypotheses
 
     @property
     def linked(self) -> bool:
@@ -129,9 +117,7 @@ def chains_of(
 ) -> Chains | None:
     """Chains from the steps (N - 1,) in pixels between photos, NaN where unknown; None where there are too few.
 
-    Args:
-        p, e, resolution_s: as in `Chains`. path_m: (K,) way of each event.
-        offset, drift: a clock that is about right.
+    p, e, resolution_s: as in `Chains`. path_m: (K,) way of each event. offset, drift: a clock that is about right.
     """
     ways = np.interp((p - offset) / (1.0 + drift), e, path_m)
     scale = _scale(_split(steps_px), ways)
@@ -149,18 +135,9 @@ def chains_of(
     phases, scales = (part.ravel() for part in np.meshgrid(reach, _CHAIN_SCALES, indexing="ij"))
     step_m = float(np.median(np.diff(path_m)))
     return Chains(
-        number=number,
-        along_px=along,
-        path_m=path_m,
-        e=e,
-        p=p,
-        resolution_s=resolution_s,
-        metres_a_pixel=scale[0],
-        sigma_m=scale[1],
-        step_m=step_m,
-        phases_s=phases,
-        scales=scales,
-    )
+        number=number, along_px=along, path_m=path_m, e=e, p=p, resolution_s=resolution_s, metres_a_pixel=scale[0],
+        sigma_m=scale[1], step_m=step_m, phases_s=phases, scales=scales,
+    )  # fmt: skip
 
 
 def _split(steps_px: Array) -> tuple[Indices, Array]:
@@ -203,8 +180,7 @@ def picture_motion(photos: Sequence[Photo], log: FlightLog, timeline: Timeline, 
     if len(poses) < 2 or not all(pose.has_position for pose in poses):
         return None
     poses = poses if log.has_gimbal else [fixed_camera(pose) for pose in poses]
-    files = [PictureFile(photo.path, photo.width, photo.height) for photo in photos]
-    return PictureMotion(_way_m(poses), lambda some: shifts_px([files[i] for i in some], workers))
+    return PictureMotion(_way_m(poses), lambda some: shifts_px([photos[i] for i in some], workers))
 
 
 def _way_m(poses: Sequence[Sample]) -> Array:

@@ -24,8 +24,7 @@ from telemetry.ingest.pairing.sequence_model import (
     posterior,
 )
 
-Clock = tuple[float, float]
-"""Offset in seconds and drift."""
+Clock = tuple[float, float]  # offset in seconds and drift
 
 CERTAIN: Final = 1.0 - 1e-4  # probability from which on a pairing counts as certain
 _OTHER_CLOCK_INTERVALS: Final = 10.0  # clocks that differ by more usual intervals are two ways to pair a flight
@@ -51,26 +50,16 @@ _LEAST_PROBABILITY: Final = 0.02  # events that a photo has with less probabilit
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SequenceMatch:
-    """Probabilities of pairings.
+    """Probabilities of pairings."""
 
-    Attributes:
-        events: (K,) index of each event, without repetitions.
-        first: (N,) index into `events` of column 0 of a photo's row.
-        probability: (N, B) of each photo and event.
-        offset_s: photo time minus event time in the middle of the events. drift: rate of the photo's clock minus one.
-        resolution_s: of the photo's clock.
-        by_pictures: whether the pictures were asked, too.
-        other_clock: probability that the clocks differ by another offset, some intervals away.
-    """
-
-    events: Indices
-    first: Indices
-    probability: Array
-    offset_s: float
-    drift: float
-    resolution_s: float
-    by_pictures: bool = False
-    other_clock: float = 0.0
+    events: Indices  # (K,) index of each event, without repetitions
+    first: Indices  # (N,) index into `events` of column 0 of a photo's row
+    probability: Array  # (N, B) of each photo and event
+    offset_s: float  # photo time minus event time in the middle of the events
+    drift: float  # rate of the photo's clock minus one
+    resolution_s: float  # of the photo's clock
+    by_pictures: bool = False  # whether the pictures were asked, too
+    other_clock: float = 0.0  # probability that the clocks differ by another offset, some intervals away
 
     def pairs(self) -> list[tuple[int, int, float]]:
         """The alignment with the most expected matches: photo, event (both increasing) and probability.
@@ -160,15 +149,9 @@ def _alignment(model: SequenceModel, windows: list[Clock], single: Indices) -> S
         keep = max(0, min(probability.shape[1] - (at - lo), len(single) - at))
         shifted[i, :keep] = probability[i, at - lo : at - lo + keep]
     return SequenceMatch(
-        events=single,
-        first=inside,
-        probability=shifted,
-        offset_s=offset,
-        drift=drift,
-        resolution_s=model.resolution_s,
-        by_pictures=model.chains is not None,
-        other_clock=other_clock,
-    )
+        events=single, first=inside, probability=shifted, offset_s=offset, drift=drift, resolution_s=model.resolution_s,
+        by_pictures=model.chains is not None, other_clock=other_clock,
+    )  # fmt: skip
 
 
 def _decided(match: SequenceMatch) -> Flags:
@@ -299,11 +282,6 @@ def _plausible(model: SequenceModel) -> tuple[SequenceModel, list[Clock]]:
     return model, windows
 
 
-def _window(model: SequenceModel, centre: Clock) -> ClockGrid:
-    """A fine grid of clocks around one."""
-    return clock_grid(model, *centre, 2.0 * FIRST_JITTER_S + 0.3 * _reach_s(model), _WINDOW_DRIFT_S)
-
-
 def _inside(model: SequenceModel, centre: Clock, offset: Array, drift: Array, *, share: float = 1.0) -> Flags:
     """Which clocks lie in a share of the window around one."""
     half = max(0.5 * float(np.ptp(model.e)), 1e-3)
@@ -346,7 +324,7 @@ def _probabilities(model: SequenceModel, windows: list[Clock]) -> tuple[Indices,
     """
     scored = []
     for number, centre in enumerate(windows):
-        grid = _window(model, centre)
+        grid = clock_grid(model, *centre, 2.0 * FIRST_JITTER_S + 0.3 * _reach_s(model), _WINDOW_DRIFT_S)
         fresh = np.ones(len(grid.offset), dtype=bool)
         for other in windows[:number]:
             fresh &= ~_inside(model, other, grid.offset, grid.drift)

@@ -28,26 +28,18 @@ _FALSE_TIME: Final = 1e-5  # probability of an exposure that is closer to anothe
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SequenceModel:
-    """Times of photos and events, each relative to its own origin, and the model's parameters.
+    """Times of photos and events, each relative to its own origin, and the model's parameters."""
 
-    Attributes:
-        p: (N,) middle of each photo's interval. e: (M,) from the middle of the events.
-        resolution_s: width of a photo's interval. interval_s: time between exposures that matches are weighed with.
-        jitter_s: one sigma.
-        no_event, no_photo: odds that a photo's event is missing, and an event's photo.
-        least_s: time between exposures that none goes below.
-        chains: what the pictures show, None where they were not asked.
-    """
-
-    p: Array
-    e: Array
-    resolution_s: float
-    interval_s: float
-    least_s: float
-    jitter_s: float = field(default_factory=lambda: FIRST_JITTER_S)
+    p: Array  # (N,) middle of each photo's interval
+    e: Array  # (M,) from the middle of the events
+    resolution_s: float  # width of a photo's interval
+    interval_s: float  # time between exposures that matches are weighed with
+    least_s: float  # time between exposures that none goes below
+    jitter_s: float = field(default_factory=lambda: FIRST_JITTER_S)  # one sigma
+    # no_event, no_photo: odds that a photo's event is missing, and an event's photo
     no_event: float = 0.1
     no_photo: float = 0.1
-    chains: Chains | None = None
+    chains: Chains | None = None  # what the pictures show, None where they were not asked
 
     @property
     def hypotheses(self) -> int:
@@ -138,15 +130,10 @@ def clock_grid(model: SequenceModel, offset: float, drift: float, reach_s: float
 
 @dataclass(slots=True)
 class Forward:
-    """Sums over all alignments that end with a match.
+    """Sums over all alignments that end with a match."""
 
-    Attributes:
-        evidence: (H,) logarithm of the sum over all alignments.
-        rows: (N, H C, B) each divided by the exponential of scales (N, H C); empty unless asked for.
-    """
-
-    evidence: Array
-    rows: Array
+    evidence: Array  # (H,) logarithm of the sum over all alignments
+    rows: Array  # (N, H C, B) each divided by the exponential of scales (N, H C); empty unless asked for
     scales: Array
 
 

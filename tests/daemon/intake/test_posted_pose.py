@@ -12,7 +12,7 @@ def test_a_pose_comes_back_as_it_was_recorded():
 
     from gcs_plugin.daemon.intake.posted_pose import posted_frame
     from telemetry.samples.sample import Sample
-    from telemetry.samples.sample_frame import frame_of as recorded_frame
+    from telemetry.samples.sample import frame_of as recorded_frame
 
     random.seed(3)
     for _ in range(500):

@@ -19,7 +19,7 @@ from orthoswarm.refine.bundle.flight_records import read_records
 from orthoswarm.refine.flight.vehicle_refinement import LONGEST_UNIT_PHOTOS, merge_units, split_units
 from orthoswarm.refine.flight.weakly_held_pictures import interpolate_weak
 from orthoswarm.trajectory.legs import split_legs
-from orthoswarm.trajectory.separate_places import separate_places
+from orthoswarm.trajectory.near_paths import separate_places
 
 
 def frame(i, vehicle="a", camera="x", size=(640, 480), **fix):

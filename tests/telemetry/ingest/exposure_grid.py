@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from telemetry.ingest.pairing.event_pairing import by_time
 from telemetry.ingest.pairing.motion_chains import PictureMotion
-from telemetry.photos.picture_motion import PictureFile, shifts_px
+from telemetry.photos.photo_tags import Photo
+from telemetry.photos.picture_motion import shifts_px
 
 Array = NDArray[np.float64]
 
@@ -122,7 +123,7 @@ def flown_over(
         noisy = np.clip(patch + rng.normal(0.0, 4.0, patch.shape), 0, 255).astype(np.uint8)
         path = folder / f"{number:04d}.jpg"
         cv2.imwrite(str(path), noisy)
-        pictures.append(PictureFile(path, *_SIZE))
+        pictures.append(Photo(path=path, width=_SIZE[0], height=_SIZE[1]))
     steps = np.hypot(*np.diff(logged[flown.of_event], axis=0).T)
     path_m = np.concatenate([[0.0], np.cumsum(steps)])
     return PictureMotion(path_m, lambda some: shifts_px([pictures[i] for i in some]))

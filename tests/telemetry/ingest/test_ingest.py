@@ -300,8 +300,7 @@ def test_jwcate_takes_flight_and_gimbal_yaw_together(real_data):
 
 
 def test_a_frame_is_made_of_a_sample():
-    from telemetry.samples.sample import Sample
-    from telemetry.samples.sample_frame import frame_of
+    from telemetry.samples.sample import Sample, frame_of
 
     place = {"image": "a.jpg", "path": Path("a.jpg"), "vehicle": "v", "width": 64, "height": 48}
     assert frame_of(Sample(yaw_deg=3.0), **place) is None

@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
     from gcs_plugin.cli.arguments import ProgressBars, require_no_file
     from orthoswarm.change.of_folder import change_of
     from orthoswarm.compute.workers import prepare_process
-    from orthoswarm.report.change_section import put_section
+    from orthoswarm.report.page import put_section
 
     if not 0.25 <= args.want_m < 1000.0:
         raise InputError(f"--want-m is {args.want_m:g}; give metres, 0.25 or more")

@@ -67,10 +67,9 @@ def run(args: argparse.Namespace) -> int:
         flown = _judged(flown)
     cover = _cover(args, flown, area)
     plan = None if args.plan is None else read_planned_flight(args.plan, area.grid)
-    found = missing_by_events(flown.views, _events(args.log, flown, area.grid), flown.rejected)
-    missing = found.pictures
+    missing, doubts = missing_by_events(flown.views, _events(args.log, flown, area.grid), flown.rejected)
     gaps = find_gaps(cover, missing, plan)
-    warnings = [*flown.warnings, *found.warnings]
+    warnings = [*flown.warnings, *doubts]
     if not (cover.best[cover.cells.wanted] != 255).any():
         warnings.append("no picture sees any of the area: check that the area and the flight belong together")
     figures = _figures(cover, gaps, missing, area.grid, warnings)
