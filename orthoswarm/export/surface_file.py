@@ -8,7 +8,7 @@ import numpy as np
 
 from orthoswarm.export.cog import software
 from orthoswarm.export.value_raster import write_values
-from orthoswarm.stereo.surface_cells import SurfaceModel
+from orthoswarm.model.placement import SurfaceModel
 
 NO_DATA = -9999.0
 """What other programs expect for "no height"."""
@@ -20,7 +20,7 @@ _NO_DATUM: Final = "none: heights are over the takeoff level"
 def write_surface(
     path: Path, surface: SurfaceModel, takeoff_altitude_m: float | None, common_sigma_m: float | None = None
 ) -> None:
-    """Write a COG, float32: band 1 height, band 2 one sigma, both metres, band 3 number of agreeing pairs.
+    """Write a COG, float32: band 1 height, band 2 one sigma, both metres, band 3 number of agreeing measurements.
 
     The sigma is that of a height against those around. What is wrong with all heights alike stands in its description.
 
@@ -42,7 +42,7 @@ def write_surface(
     bands = {
         f"height of the visible surface over {zero}, metres": surface.height_m + np.float32(takeoff_altitude_m or 0.0),
         f"one sigma of the height against those around, metres; {common}": surface.sigma_m,
-        "pairs of pictures that agree": surface.pairs.astype(np.float32),
+        "measurements that agree": surface.measurements.astype(np.float32),
     }
     tags = {"HEIGHTS_FROM": zero, "VERTICAL_DATUM": _NO_DATUM, "TIFFTAG_SOFTWARE": software()}
     if takeoff_altitude_m is not None:

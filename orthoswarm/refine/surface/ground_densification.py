@@ -13,10 +13,11 @@ from orthoswarm.refine.flight.relative_block import FlightBlock
 from orthoswarm.refine.surface.terrain import TerrainFit
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_surface
 from orthoswarm.refine.surface.vertical_line_locus import (
+    LARGE_PATCH,
     REFERENCE_HEIGHT_M,
+    SMALL_PATCH,
     LocusPoints,
     ReadPicture,
-    Sweep,
     dense_ground,
     height_above,
     spaced_cameras,
@@ -30,7 +31,7 @@ _FREE_REACH_M: Final = 3.0  # heights searched there above and below the surface
 _FREE_HEIGHT_STEP_M: Final = 0.25  # distance of these heights at the reference height
 _DENSE_CELL_M: Final = 14.0  # side of the cells that get one height each at the reference height
 _DENSE_MOST_CELLS: Final = 400_000  # areas of more cells are left without dense points (memory)
-_HIGH_BASELINES_M: Final = (25.0, 50.0, 75.0)  # baselines of that search at reference height
+_HIGH_BASELINES_M: Final = (30.0, 65.0)  # baselines of that search at reference height
 
 
 def refit_ground(flight: FlightBlock, surface: GroundModel, *, as_smooth: bool = False) -> GroundModel:
@@ -62,7 +63,7 @@ def free_ground(
     rectified on it are displaced from the map by that height times the obliquity of the view. Small patches away from
     corners measure the ground itself; large ones include rubble and find half of the difference.
     """
-    near = replace(Sweep.small(), reach_m=_FREE_REACH_M, height_step_m=_FREE_HEIGHT_STEP_M, rival_m=np.inf)
+    near = replace(SMALL_PATCH, reach_m=_FREE_REACH_M, height_step_m=_FREE_HEIGHT_STEP_M, rival_m=np.inf)
     sweep = near.at_height(height_above(cameras, terrain))
     return dense_ground(cameras, gray, positions, terrain=terrain, leg_of_camera=leg, sweeps=(sweep,))
 
@@ -81,7 +82,7 @@ def dense_points(flight: FlightBlock, surface: GroundModel) -> tuple[Array, Arra
     if reach_m > 0.0:
         left = np.delete(cells, found.cell, axis=0)
         raised = replace(ground, z=ground.z + np.float32(middle_m))
-        patches = (replace(s, baselines_m=_HIGH_BASELINES_M) for s in (Sweep.small(), Sweep.large()))
+        patches = (replace(s, baselines_m=_HIGH_BASELINES_M) for s in (SMALL_PATCH, LARGE_PATCH))
         sweeps = [replace(s.at_height(height), reach_m=reach_m) for s in patches]
         high = dense_ground(cameras, gray, left, terrain=raised, leg_of_camera=flight.leg, sweeps=sweeps).points
     return found.points, found.sigma_z, high
@@ -89,8 +90,8 @@ def dense_points(flight: FlightBlock, surface: GroundModel) -> tuple[Array, Arra
 
 def spaced_pictures(flight: FlightBlock, surface: GroundModel) -> Flags:
     """Pictures used by `dense_points`, which cover all visible ground, and those between legs: bool (N,)."""
-    spacing_m = Sweep.small().at_height(flying_height(flight, surface)).spacing_m
-    _, camera, _ = spaced_cameras(flight.cameras(), flight.leg, spacing_m)
+    spacing_m = SMALL_PATCH.at_height(flying_height(flight, surface)).spacing_m
+    camera, _ = spaced_cameras(flight.cameras(), flight.leg, spacing_m)
     out = np.asarray(flight.leg < 0)
     out[camera] = True
     return out

@@ -19,77 +19,40 @@ def _sees(position, rotation, lens, x, y, z, half_m):  # type: ignore[no-untyped
 
 
 @in_place_kernel
-def choose(cameras, usable, cells, plane, half_m, wished, least, enough, ref, partner):  # type: ignore[no-untyped-def]
-    """For each cell the picture nearest to nadir and its partners: those closest to the desired signed baselines.
+def choose(cameras, usable, heading, cells, plane, half_m, wished, least, ref, partner):  # type: ignore[no-untyped-def]
+    """For each cell the picture nearest to nadir, and those nearest to wished places before and behind it on its leg.
 
-    usable: pictures, their legs and places along these. least: shortest baseline. enough: below this number of
-    partners, pictures of other legs are added.
+    usable: int32 (K,), pictures; heading: float64 (K, 2), their legs' directions. wished: float64 (W,), signed
+    distances along the leg; where it ends, pictures of other legs are nearest. least: shortest baseline. ref: int32
+    (C,), partner: int32 (C, W), set where there is one.
     """
     position, rotation, lens_id, lens = cameras
-    key, leg, along = usable
     for c in range(len(cells)):
         x, y, z = cells[c, 0], cells[c, 1], plane[c, 0]
         best, r = np.inf, -1
-        for k in range(len(key)):
-            i = key[k]
+        for k in range(len(usable)):
+            i = usable[k]
             d = (position[i, 0] - x) ** 2 + (position[i, 1] - y) ** 2
             if d < best and _sees(position[i], rotation[i], lens[lens_id[i]], x, y, z, half_m):
                 best, r = d, k
         if r < 0:
             continue
-        ref[c] = key[r]
-        first, last = r, r
-        while first > 0 and leg[first - 1] == leg[r]:
-            first -= 1
-        while last + 1 < len(key) and leg[last + 1] == leg[r]:
-            last += 1
+        ref[c] = usable[r]
+        ox, oy = position[ref[c], 0], position[ref[c], 1]
         for w in range(len(wished)):
-            nearest, choice = np.inf, -1
-            for k in range(first, last + 1):
-                b = along[k] - along[r]
-                if b * wished[w] <= 0.0 or abs(b) < least or abs(b - wished[w]) >= nearest:
+            wx, wy = ox + wished[w] * heading[r, 0], oy + wished[w] * heading[r, 1]
+            nearest = np.inf
+            for k in range(len(usable)):
+                i = usable[k]
+                px, py = position[i, 0], position[i, 1]
+                d = (px - wx) ** 2 + (py - wy) ** 2
+                if d >= nearest or (px - ox) ** 2 + (py - oy) ** 2 < least * least:
                     continue
-                i = key[k]
                 chosen = False
                 for q in range(w):
                     chosen = chosen or partner[c, q] == i
                 if not chosen and _sees(position[i], rotation[i], lens[lens_id[i]], x, y, z, half_m):
-                    nearest, choice = abs(b - wished[w]), i
-            partner[c, w] = choice
-        _fill_from_other_legs(cameras, key, leg, r, x, y, z, half_m, wished, least, enough, partner[c])
-
-
-@in_place_kernel
-def _fill_from_other_legs(cameras, key, leg, r, x, y, z, half_m, wished, least, enough, partner):  # type: ignore[no-untyped-def]
-    """Add the nearest pictures of other legs where the reference's own leg ends before enough partners are found."""
-    position, rotation, lens_id, lens = cameras
-    count, reach = 0, 0.0
-    for w in range(len(wished)):
-        count += partner[w] >= 0
-        reach = max(reach, abs(wished[w]))
-    o = key[r]
-    while count < enough:
-        best, choice = np.inf, -1
-        for k in range(len(key)):
-            i = key[k]
-            if leg[k] == leg[r]:
-                continue
-            b = np.sqrt((position[i, 0] - position[o, 0]) ** 2 + (position[i, 1] - position[o, 1]) ** 2)
-            d = (position[i, 0] - x) ** 2 + (position[i, 1] - y) ** 2
-            if b < least or b > reach or d >= best:
-                continue
-            chosen = False
-            for w in range(len(wished)):
-                chosen = chosen or partner[w] == i
-            if not chosen and _sees(position[i], rotation[i], lens[lens_id[i]], x, y, z, half_m):
-                best, choice = d, i
-        if choice < 0:
-            return
-        for w in range(len(wished)):
-            if partner[w] < 0:
-                partner[w] = choice
-                break
-        count += 1
+                    nearest, partner[c, w] = d, i
 
 
 @in_place_kernel
@@ -107,24 +70,19 @@ def _on_plane(x, y, z, gx, gy, cx, cy, cz, px, py, pz, h):  # type: ignore[no-un
 
 
 @kernel
-def _rectify(  # type: ignore[no-untyped-def]
-    image, factor, rows, columns, position, rotation, lens, x, y, plane, ex, ey, step, half_u, half_v, out
-):
-    """Sample a picture on a plane: out[j, i] at (i - half_u) step along e and (j - half_v) step across it.
+def _rectify(image, factor, position, rotation, lens, x, y, plane, ex, ey, step, half_u, half_v, out):  # type: ignore[no-untyped-def]
+    """Sample a picture on a plane: out[j, i] at (i - half_u) step along e and (j - half_v) step across it, NaN outside.
 
-    Nine projections and biquadratic interpolation between them: exact to 0.01 px over such small windows. Returns
-    the first and last column that lie in the picture in every row (first > last: none).
+    Nine projections and biquadratic interpolation between them: exact to 0.01 px over such small windows.
     """
+    rows, columns = int(lens[7] / factor), int(lens[6] / factor)
     u, v = np.empty((3, 3)), np.empty((3, 3))
     for a in range(3):
         for b in range(3):
             s, t = (b - 1) * half_u * step, (a - 1) * half_v * step
             px, py = s * ex - t * ey, s * ey + t * ex
             pu, pv = project_point(position, rotation, lens, x + px, y + py, plane[0] + plane[1] * px + plane[2] * py)
-            if np.isnan(pu):
-                return 1, 0
             u[a, b], v[a, b] = (pu + 0.5) / factor - 0.5, (pv + 0.5) / factor - 0.5
-    first, last = 0, 2 * half_u
     for j in range(2 * half_v + 1):
         t = (j - half_v) / half_v
         c0, c1, c2 = 0.5 * t * (t - 1.0), 1.0 - t * t, 0.5 * t * (t + 1.0)
@@ -132,46 +90,23 @@ def _rectify(  # type: ignore[no-untyped-def]
         um, vm = c0 * u[0, 1] + c1 * u[1, 1] + c2 * u[2, 1], c0 * v[0, 1] + c1 * v[1, 1] + c2 * v[2, 1]
         ur, vr = c0 * u[0, 2] + c1 * u[1, 2] + c2 * u[2, 2], c0 * v[0, 2] + c1 * v[1, 2] + c2 * v[2, 2]
         ua, ub, va, vb = 0.5 * (ur - ul), 0.5 * (ur + ul) - um, 0.5 * (vr - vl), 0.5 * (vr + vl) - vm
-        while first <= last and not _inside(first, half_u, um, ua, ub, vm, va, vb, rows, columns):
-            first += 1
-        while first <= last and not _inside(last, half_u, um, ua, ub, vm, va, vb, rows, columns):
-            last -= 1
-        if _leaves(first, last, half_u, um, ua, ub, columns) or _leaves(first, last, half_u, vm, va, vb, rows):
-            return 1, 0
-        for i in range(first, last + 1):
+        for i in range(2 * half_u + 1):
             s = (i - half_u) / half_u
             uu, vv = um + s * (ua + s * ub), vm + s * (va + s * vb)
+            if not (uu >= 0.0 and vv >= 0.0 and uu < columns - 1.0 and vv < rows - 1.0):
+                out[j, i] = np.nan
+                continue
             iu, iv = int(uu), int(vv)
             fu, fv = np.float32(uu - iu), np.float32(vv - iv)
             p, q = np.float32(image[iv, iu]), np.float32(image[iv, iu + 1])
             c, d = np.float32(image[iv + 1, iu]), np.float32(image[iv + 1, iu + 1])
             low = p + fu * (q - p)
             out[j, i] = low + fv * (c + fu * (d - c) - low)
-    return first, last
 
 
 @in_place_kernel
-def _inside(i, half_u, um, ua, ub, vm, va, vb, rows, columns):  # type: ignore[no-untyped-def]
-    s = (i - half_u) / half_u
-    u, v = um + s * (ua + s * ub), vm + s * (va + s * vb)
-    return u >= 0.0 and v >= 0.0 and u < columns - 1.0 and v < rows - 1.0
-
-
-@in_place_kernel
-def _leaves(first, last, half_u, middle, slope, bend, size):  # type: ignore[no-untyped-def]
-    """True if a row that begins and ends inside the picture leaves it in between (at a cliff)."""
-    if bend == 0.0:
-        return False
-    s = -0.5 * slope / bend
-    if not (first - half_u <= s * half_u <= last - half_u):
-        return False
-    extreme = middle + 0.5 * s * slope
-    return not (extreme >= 0.0 and extreme < size - 1.0)
-
-
-@in_place_kernel
-def _zncc_along(patch, strip, first, last, least_variance, score):  # type: ignore[no-untyped-def]
-    """Normalised correlation of a square patch with every place in a strip; NaN where the strip has no data."""
+def _zncc_along(patch, strip, least_variance, score):  # type: ignore[no-untyped-def]
+    """Normalised correlation of a square patch with every place in a strip; NaN where either has no data."""
     n = len(patch)
     count = np.float32(n * n)
     mean = np.float32(patch.sum()) / count
@@ -181,9 +116,9 @@ def _zncc_along(patch, strip, first, last, least_variance, score):  # type: igno
             patch[j, i] -= mean
             energy += patch[j, i] * patch[j, i]
     score[:] = np.nan
-    if energy < least_variance * count:
+    if not energy >= least_variance * count:
         return
-    for k in range(first, last - n + 2):
+    for k in range(len(score)):
         dot, total, square = np.float32(0.0), np.float32(0.0), np.float32(0.0)
         for j in range(n):
             for i in range(n):
@@ -215,20 +150,16 @@ def _pair(cameras, pictures, x, y, plane, r, p, heights, half, step, least_varia
     low, high = (ax - x) * ex + (ay - y) * ey, (bx - x) * ex + (by - y) * ey
     reach = int(max(-low, high) / step) + 3
     half_u = half + reach
-    lr, lp, fr, fp = lens[lens_id[r]], lens[lens_id[p]], factor[lens_id[r]], factor[lens_id[p]]
     patch, strip = np.empty((n, n), np.float32), np.empty((n, 2 * half_u + 1), np.float32)
-    a, b = _rectify(
-        stack[slot[r]], fr, int(lr[7] / fr), int(lr[6] / fr), position[r], rotation[r], lr, x, y, plane,
-        ex, ey, step, half, half, patch,
+    _rectify(
+        stack[slot[r]], factor, position[r], rotation[r], lens[lens_id[r]], x, y, plane, ex, ey, step, half, half, patch
     )  # fmt: skip
-    if a > 0 or b < n - 1:
-        return
-    a, b = _rectify(
-        stack[slot[p]], fp, int(lp[7] / fp), int(lp[6] / fp), position[p], rotation[p], lp, x, y, plane,
-        ex, ey, step, half_u, half, strip,
+    _rectify(
+        stack[slot[p]], factor, position[p], rotation[p], lens[lens_id[p]], x, y, plane, ex, ey, step, half_u, half,
+        strip,
     )  # fmt: skip
     score = np.empty(2 * reach + 1, np.float32)
-    _zncc_along(patch, strip, a, b, least_variance, score)
+    _zncc_along(patch, strip, least_variance, score)
     for h in range(len(heights)):
         qx, qy = _on_plane(x, y, z, gx, gy, cx, cy, cz, px, py, pz, heights[h])
         s = ((qx - x) * ex + (qy - y) * ey) / step + reach
@@ -248,7 +179,7 @@ def _pair(cameras, pictures, x, y, plane, r, p, heights, half, step, least_varia
 def correlate(cameras, pictures, cells, plane, ref, partner, heights, half, step, least_variance, curve):  # type: ignore[no-untyped-def]
     """Mean normalised correlation over partners for each cell and height; NaN with fewer than two partners.
 
-    pictures: uint8 (slots, rows, columns) those in memory, each camera's slot, and by how much each lens's are reduced.
+    pictures: uint8 (slots, rows, columns) those in memory, each camera's slot, and by how much they are reduced.
     """
     total, seen = np.empty(len(heights)), np.empty(len(heights), np.int64)
     for c in range(len(cells)):

@@ -8,7 +8,6 @@ height is a shift. Pictures are read one after the other along the legs, with on
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.model.arrays import Array, Gray, Indices, Ints
 from orthoswarm.model.placement import Terrain
-from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock, F
+from orthoswarm.refine.bundle.block_arrays import CameraBlock, F
 from orthoswarm.refine.features.working_pictures import shrunk
 from orthoswarm.refine.surface import vertical_line_kernels as kernels
 
@@ -25,26 +24,15 @@ ReadPicture = Callable[[int], Gray]
 REFERENCE_HEIGHT_M: Final = 150.0  # flying height for which lengths of patches are stated
 _SWEEP_REACH_M: Final = 9.0  # heights searched above and below the terrain
 _SWEEP_HEIGHT_STEP_M: Final = 0.375  # distance of the heights searched at reference height
-_SWEEP_BASELINES_M: Final = (40.0, 75.0, 110.0)  # wished distances of partners on both sides, at reference height
+_SWEEP_BASELINES_M: Final = (50.0, 95.0)  # wished distances of partners on both sides, at reference height
 _SWEEP_SPACING_M: Final = 17.0  # only pictures this far apart along a leg are used at reference height
 _SWEEP_LEAST_BASELINE_SHARE: Final = 0.4  # least baseline as a share of the shortest that is wished
-_SWEEP_PARTNERS: Final = 3  # partners below which pictures of other legs are asked for, where a leg ends
 _SWEEP_RIVAL_M: Final = 4.0  # second peak farther than this from the best makes a height ambiguous at reference height
 _SWEEP_RIVAL_SHARE: Final = 0.95  # ... if it is above this share of the best
 _SWEEP_LEAST_VARIANCE: Final = 2.0  # least variance of a patch's grey values, squared: less is the noise of a JPEG
 _SWEEP_STEEPEST: Final = 1.5  # steepest slope of a patch's plane: across a wall it is none
 _SWEEP_SLOPE_REACH_M: Final = 5.0  # the slope below a patch is taken over this distance at least
-_SWEEP_PICTURES: Final = 64  # pictures held at a time (memory)
-_SMALL_PATCH_HALF: Final = 4  # half width of the small patch, samples: 9 x 9
-_SMALL_PATCH_STEP_M: Final = 0.5
-"""Distance of its samples at the reference height. It fits between cars, bushes and houses: on a street scene three
-quarters of its heights lie within 0.2 m of bare ground, half of the large one's, most others above."""
-_SMALL_PATCH_SCORE: Final = 0.7  # least mean normalised correlation of the small patch
-_SMALL_PATCH_SIGMA_M: Final = 0.15  # sigma of its heights at the reference height (see `_SMALL_PATCH_STEP_M`)
-_LARGE_PATCH_HALF: Final = 7  # half width of the large patch, samples (15 x 15): heights where texture is weak
-_LARGE_PATCH_STEP_M: Final = 0.7  # distance of its samples at the reference height
-_LARGE_PATCH_SCORE: Final = 0.6  # least mean normalised correlation of the large patch
-_LARGE_PATCH_SIGMA_M: Final = 0.25  # sigma of its heights on open ground at the reference height
+_SWEEP_REFERENCES: Final = 16  # references whose pictures, and those of their partners, are held at a time (memory)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,22 +58,6 @@ class Sweep:
     baselines_m: tuple[float, ...] = _SWEEP_BASELINES_M
     spacing_m: float = _SWEEP_SPACING_M
 
-    @classmethod
-    def small(cls) -> "Sweep":
-        """Small patches, which fit between cars, bushes and houses, so that most of their heights are bare ground."""
-        return cls(
-            half=_SMALL_PATCH_HALF, step_m=_SMALL_PATCH_STEP_M, min_score=_SMALL_PATCH_SCORE,
-            sigma_m=_SMALL_PATCH_SIGMA_M,
-        )  # fmt: skip
-
-    @classmethod
-    def large(cls) -> "Sweep":
-        """Large patches, for ground with little texture."""
-        return cls(
-            half=_LARGE_PATCH_HALF, step_m=_LARGE_PATCH_STEP_M, min_score=_LARGE_PATCH_SCORE,
-            sigma_m=_LARGE_PATCH_SIGMA_M,
-        )  # fmt: skip
-
     def at_height(self, height_m: float) -> "Sweep":
         """The same sweep for cameras at another height above ground: all lengths but the reach are scaled."""
         k = height_m / REFERENCE_HEIGHT_M
@@ -100,19 +72,23 @@ class Sweep:
         return np.asarray(np.arange(-count, count + 1) * self.height_step_m, np.float64)
 
 
+SMALL_PATCH: Final = Sweep(half=4, step_m=0.5, min_score=0.7, sigma_m=0.15)
+"""It fits between cars, bushes and houses: on a street scene three quarters of its heights lie within 0.2 m of bare
+ground, half of the large one's, most others above."""
+LARGE_PATCH: Final = Sweep(half=7, step_m=0.7, min_score=0.6, sigma_m=0.25)  # heights where texture is weak
+
+
 @dataclass(frozen=True, slots=True)
 class LocusPoints:
     """Points found by a sweep.
 
     Attributes:
         points: float64 (M, 3), on the reference's ray through the position, so slightly off the position.
-        sigma_z: float64 (M,), one sigma of each height. score: float64 (M,), mean normalised correlation at the peak.
-        cell: int64 (M,), which of the positions each point belongs to, ascending.
+        sigma_z: float64 (M,), one sigma of each height. cell: int64 (M,), position that each belongs to, ascending.
     """
 
     points: Array
     sigma_z: Array
-    score: Array
     cell: Indices
 
 
@@ -124,46 +100,52 @@ def dense_ground(
     terrain: Terrain,
     leg_of_camera: NDArray[np.integer],
     sweeps: Sequence[Sweep] | None = None,
-    slots: int = _SWEEP_PICTURES,
 ) -> LocusPoints:
     """Heights at free positions from correlation between pictures, preferably of one leg.
 
     Args:
         gray: picture of a camera by its index, uint8 (rows, columns) as its lens says; called in the order of the
-            legs, once per picture unless a window of `slots` pictures is too short.
+            legs, for a picture twice at most unless it is a partner on another leg.
         cells: float64 (C, 2), positions, east and north.
         terrain: surface around which heights are searched; its slope tilts the patches.
         leg_of_camera: int (N,), leg of each camera, -1 for cameras that must not be used.
         sweeps: applied in order, each to the positions where those before found nothing. Baselines and spacing are the
             first one's. None: small patches, then large, for the cameras' height above the terrain.
-        slots: pictures in memory at a time (more only if the cells of one reference need more).
     """
     if sweeps is None:
         height = height_above(cameras, terrain)
-        sweeps = (Sweep.small().at_height(height), Sweep.large().at_height(height))
+        sweeps = (SMALL_PATCH.at_height(height), LARGE_PATCH.at_height(height))
     s = sweeps[0]
     cells = np.ascontiguousarray(cells, dtype=np.float64).reshape(-1, 2)
     plane = _planes(terrain, cells, max(_SWEEP_SLOPE_REACH_M, s.half * s.step_m))
-    leg, camera, along = spaced_cameras(cameras, leg_of_camera, s.spacing_m)
-    ref = np.full(len(cells), -1, np.int32)
+    camera, heading = spaced_cameras(cameras, leg_of_camera, s.spacing_m)
+    wished = np.array([*s.baselines_m, *(-b for b in s.baselines_m)])
+    ref, partner = np.full(len(cells), -1, np.int32), np.full((len(cells), len(wished)), -1, np.int32)
+    least = _SWEEP_LEAST_BASELINE_SHARE * min(s.baselines_m)
+    kernels.choose(cameras.arrays, camera, heading, cells, plane, s.half * s.step_m, wished, least, ref, partner)
     found = np.full((len(cells), 3), -1.0)
-    if len(camera) and len(cells):
-        wished = np.array([*s.baselines_m, *(-b for b in s.baselines_m)])
-        partner = np.full((len(cells), len(wished)), -1, np.int32)
-        least = _SWEEP_LEAST_BASELINE_SHARE * min(s.baselines_m)
-        kernels.choose(
-            cameras.arrays, (camera, leg, along), cells, plane, s.half * s.step_m, wished, least, _SWEEP_PARTNERS,
-            ref, partner,
-        )  # fmt: skip
-        order = np.full(len(cameras), -1, np.int64)
-        order[camera] = np.arange(len(camera))
-        _sweep_in_windows(
-            cameras, gray, order, cells, plane, ref=ref, partner=partner, sweeps=sweeps, slots=slots, found=found
-        )
+    gsd_m = height_above(cameras, terrain) / float(cameras.lens[:, F].max())
+    factor = max(1, int(min(sweep.step_m for sweep in sweeps) / gsd_m))
+    for first in range(0, len(camera), _SWEEP_REFERENCES):  # in the order of the legs
+        left = np.flatnonzero(np.isin(ref, camera[first : first + _SWEEP_REFERENCES]))
+        if len(left):
+            held = np.unique([ref[left], *partner[left].T])
+            held = held[held >= 0]
+            _search(
+                cameras,
+                _stacked(cameras, gray, held, factor),
+                cells,
+                plane,
+                ref=ref,
+                partner=partner,
+                sweeps=sweeps,
+                left=left,
+                found=found,
+            )
     good = np.flatnonzero(found[:, 1] >= 0.0)
     points = np.empty((len(good), 3))
     kernels.raise_points(cameras.position, ref[good], cells[good], plane[good], found[good, 0], points)
-    return LocusPoints(points, found[good, 2], found[good, 1], good)
+    return LocusPoints(points, found[good, 2], good)
 
 
 def height_above(cameras: CameraBlock, terrain: Terrain) -> float:
@@ -173,28 +155,27 @@ def height_above(cameras: CameraBlock, terrain: Terrain) -> float:
     return max(1.0, float(np.median(cameras.position[:, 2] - terrain.height(cameras.position[:, :2]))))
 
 
-def spaced_cameras(
-    cameras: CameraBlock, leg_of_camera: NDArray[np.integer], spacing_m: float
-) -> tuple[Indices, Ints, Array]:
-    """Cameras spaced along their legs, and each leg's last one: leg, camera and distance along it, sorted."""
+def spaced_cameras(cameras: CameraBlock, leg_of_camera: NDArray[np.integer], spacing_m: float) -> tuple[Ints, Array]:
+    """Cameras spaced along their legs, and each leg's last one, in the order of the legs: int32 (K,).
+
+    And the legs' directions, float64 (K, 2).
+    """
     camera: list[int] = []
-    leg: list[int] = []
-    along: list[float] = []
+    heading: list[Array] = []
     for number in np.unique(leg_of_camera[leg_of_camera >= 0]):
         members = np.flatnonzero(leg_of_camera == number)
         if len(members) < 2:
             continue
         p = cameras.position[members, :2]
-        way = (p - p.mean(0)) @ np.linalg.svd(p - p.mean(0), full_matrices=False)[2][0]
-        last = -np.inf
+        direction = np.linalg.svd(p - p.mean(0), full_matrices=False)[2][0]
+        way, last = (p - p.mean(0)) @ direction, -np.inf
         rank = np.argsort(way)
         for i in rank:
             if way[i] >= last + spacing_m or i == rank[-1]:
                 camera.append(int(members[i]))
-                leg.append(int(number))
-                along.append(float(way[i]))
+                heading.append(direction)
                 last = way[i]
-    return np.array(leg, np.int64), np.array(camera, np.int32), np.array(along, np.float64)
+    return np.array(camera, np.int32), np.array(heading, np.float64).reshape(-1, 2)
 
 
 def _planes(terrain: Terrain, cells: Array, reach: float) -> Array:
@@ -206,82 +187,39 @@ def _planes(terrain: Terrain, cells: Array, reach: float) -> Array:
     return np.column_stack([z, np.clip(np.column_stack([ge, gn]), -_SWEEP_STEEPEST, _SWEEP_STEEPEST)])
 
 
-def _sweep_in_windows(
+def _stacked(
+    cameras: CameraBlock, gray: ReadPicture, held: Indices, factor: int
+) -> tuple[NDArray[np.uint8], Ints, float]:
+    """Pictures as the kernel takes them: reduced ones in a stack, each camera's place in it, by how much."""
+    pictures = [shrunk(gray(int(i)), factor) for i in held]
+    stack = np.zeros((len(held), *np.max([p.shape for p in pictures], axis=0)), np.uint8)
+    for place, picture in zip(stack, pictures, strict=True):
+        place[: picture.shape[0], : picture.shape[1]] = picture
+    slot = np.full(len(cameras), -1, np.int32)
+    slot[held] = np.arange(len(held))
+    return stack, slot, float(factor)
+
+
+def _search(
     cameras: CameraBlock,
-    gray: ReadPicture,
-    order: Indices,
+    pictures: tuple[NDArray[np.uint8], Ints, float],
     cells: Array,
     plane: Array,
     *,
     ref: Ints,
     partner: Ints,
     sweeps: Sequence[Sweep],
-    slots: int,
+    left: Indices,
     found: Array,
 ) -> None:
-    """Search all cells in the order of the legs, with a bounded stack of pictures in memory.
-
-    found: float64 (C, 3), height over the plane, score, sigma of each cell; unchanged where nothing is found.
-    """
-    usable = np.flatnonzero(ref >= 0)
-    if len(usable) == 0:
-        return
-    usable = usable[np.argsort(order[ref[usable]], kind="stable")]
-    groups = [
-        (a, b, {int(c) for c in np.unique(np.c_[ref[usable[a:b]], partner[usable[a:b]]]) if c >= 0})
-        for a, b in pairwise(np.flatnonzero(np.r_[True, np.diff(ref[usable]) != 0, True]).tolist())
-    ]
-    slots = max(min(slots, int(order.max()) + 1), *(len(needed) for _, _, needed in groups))
-    window = _Window(cameras, gray, _reduction(cameras, plane, ref, min(s.step_m for s in sweeps)), slots)
-    factor = window.factor.astype(np.float64)
-
-    def search(block: Indices, needed: set[int]) -> None:
-        window.hold(sorted(needed, key=lambda camera: int(order[camera])))
-        for s in sweeps:
-            curve, peak = np.empty((len(block), len(s.heights)), np.float32), np.empty((len(block), 2))
-            kernels.correlate(
-                cameras.arrays, (window.stack, window.slot, factor), cells[block], plane[block], ref[block],
-                partner[block], s.heights, s.half, s.step_m, _SWEEP_LEAST_VARIANCE, curve,
-            )  # fmt: skip
-            kernels.peaks(curve, s.heights, s.rival_m, _SWEEP_RIVAL_SHARE, peak)
-            good = peak[:, 1] >= s.min_score
-            found[block[good], :2], found[block[good], 2] = peak[good], s.sigma_m
-            block = block[~good]
-
-    begin, held = 0, set[int]()
-    for a, _, needed in groups:
-        if held and len(held | needed) > slots:
-            search(usable[begin:a], held)
-            begin, held = a, set()
-        held |= needed
-    search(usable[begin:], held)
-
-
-class _Window:
-    """The pictures in memory, reduced to the needed resolution: a stack, and each camera's slot in it."""
-
-    def __init__(self, cameras: CameraBlock, gray: ReadPicture, factor: Indices, slots: int) -> None:
-        self.factor = factor
-        self.slot = np.full(len(cameras), -1, np.int32)
-        sizes = cameras.lens[:, [HEIGHT, WIDTH]].astype(np.int64) // factor[:, None]
-        self.stack = np.zeros((slots, int(sizes[:, 0].max()), int(sizes[:, 1].max())), np.uint8)
-        self._lens_id, self._gray, self._free = cameras.lens_id, gray, list(range(slots))
-
-    def hold(self, wanted: list[int]) -> None:
-        """Read the pictures that are not in memory yet, into the slots of those no longer needed."""
-        for camera in set(np.flatnonzero(self.slot >= 0).tolist()).difference(wanted):
-            self._free.append(int(self.slot[camera]))
-            self.slot[camera] = -1
-        for camera in wanted:
-            if self.slot[camera] < 0:
-                place = self._free.pop()
-                picture = shrunk(self._gray(camera), int(self.factor[self._lens_id[camera]]))
-                self.stack[place, : picture.shape[0], : picture.shape[1]] = picture
-                self.slot[camera] = place
-
-
-def _reduction(cameras: CameraBlock, plane: Array, ref: Ints, step: float) -> Indices:
-    """Integer by which each lens's pictures are reduced, so that pixels are not finer than the samples."""
-    above = float(np.median(cameras.position[ref[ref >= 0], 2] - plane[ref >= 0, 0]))
-    gsd = max(above, 1.0) / cameras.lens[:, F]
-    return np.maximum(1, np.floor(step / gsd)).astype(np.int64)
+    """Search the cells that are left with one sweep after the other; found: see `dense_ground`."""
+    for s in sweeps:
+        curve, peak = np.empty((len(left), len(s.heights)), np.float32), np.empty((len(left), 2))
+        kernels.correlate(
+            cameras.arrays, pictures, cells[left], plane[left], ref[left], partner[left], s.heights, s.half, s.step_m,
+            _SWEEP_LEAST_VARIANCE, curve,
+        )  # fmt: skip
+        kernels.peaks(curve, s.heights, s.rival_m, _SWEEP_RIVAL_SHARE, peak)
+        good = peak[:, 1] >= s.min_score
+        found[left[good], :2], found[left[good], 2] = peak[good], s.sigma_m
+        left = left[~good]

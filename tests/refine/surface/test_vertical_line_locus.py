@@ -8,10 +8,10 @@ import pytest
 
 from orthoswarm.model.placement import Terrain
 from orthoswarm.refine.bundle.block_arrays import CameraBlock
+from orthoswarm.refine.surface import vertical_line_locus
 from orthoswarm.refine.surface.dem_surface import kernel_mode
 from orthoswarm.refine.surface.ground_densification import draw_positions, free_ground
-from orthoswarm.refine.surface.vertical_line_kernels import _leaves
-from orthoswarm.refine.surface.vertical_line_locus import Sweep, dense_ground
+from orthoswarm.refine.surface.vertical_line_locus import LARGE_PATCH, dense_ground
 from tests.kit.draped import HEIGHT, WIDTH, Pictures, rig_of
 
 
@@ -30,7 +30,7 @@ def cells(step=9.0, pad=40.0):
     return np.c_[east.ravel(), north.ravel()]
 
 
-SWEEP = (Sweep.large().at_height(100.0),)
+SWEEP = (LARGE_PATCH.at_height(100.0),)
 
 
 def test_the_sweep_finds_the_surface_to_decimetres(hilly):
@@ -41,7 +41,6 @@ def test_the_sweep_finds_the_surface_to_decimetres(hilly):
     assert abs(np.median(error)) < 0.05
     assert np.median(np.abs(error)) < 0.12
     assert (np.abs(error) > 1.0).mean() < 0.01
-    assert (found.score >= SWEEP[0].min_score).all() and found.score.max() <= 1.0
 
 
 def test_points_stay_by_their_cells(hilly):
@@ -62,20 +61,19 @@ def test_distortion_is_honoured():
     assert np.median(np.abs(error)) < 0.12
 
 
-def test_results_do_not_depend_on_how_many_pictures_are_held(hilly):
+def test_results_do_not_depend_on_how_many_pictures_are_held(hilly, monkeypatch):
     cameras, leg, gray = hilly
-    wide = dense_ground(cameras, gray, cells(), terrain=Terrain.flat(1.0), leg_of_camera=leg, sweeps=SWEEP, slots=64)
-    gray.read.clear()
-    narrow = dense_ground(cameras, gray, cells(), terrain=Terrain.flat(1.0), leg_of_camera=leg, sweeps=SWEEP, slots=2)
+    wide = dense_ground(cameras, gray, cells(), terrain=Terrain.flat(1.0), leg_of_camera=leg, sweeps=SWEEP)
+    monkeypatch.setattr(vertical_line_locus, "_SWEEP_REFERENCES", 2)
+    narrow = dense_ground(cameras, gray, cells(), terrain=Terrain.flat(1.0), leg_of_camera=leg, sweeps=SWEEP)
     np.testing.assert_array_equal(wide.points, narrow.points)
-    assert len(gray.read) < 4 * len(cameras)
 
 
-def test_each_picture_is_read_once_when_the_window_is_wide(hilly):
+def test_each_picture_is_read_twice_at_most(hilly):
     cameras, leg, gray = hilly
     gray.read.clear()
     dense_ground(cameras, gray, cells(), terrain=Terrain.flat(1.0), leg_of_camera=leg, sweeps=SWEEP)
-    assert len(gray.read) == len(set(gray.read))
+    assert len(gray.read) < 2 * len(set(gray.read))
 
 
 def test_cameras_without_a_leg_are_not_used(hilly):
@@ -187,13 +185,3 @@ def test_a_wall_in_the_terrain_reads_no_pixel_outside_a_picture():
     cells = np.stack(np.meshgrid(np.linspace(20.0, 60.0, 60), np.linspace(20.0, 90.0, 20)), -1).reshape(-1, 2)
     found = dense_ground(cameras, pictures, cells, terrain=wall, leg_of_camera=leg)
     assert np.isfinite(found.points).all()
-
-
-@pytest.mark.parametrize(
-    ("bend", "inside"), [(0.0, True), (10.0, True), (60.0, False), (-30.0, False)], ids=lambda value: str(value)
-)
-def test_a_row_that_bends_out_of_the_picture_is_known(bend, inside):
-    # u(s) = 50 - bend + bend s^2 for s = -1..1: both ends at 50 of 60 columns
-    middle = 50.0 - bend
-    assert bool(_leaves(0, 20, 10, middle, 0.0, bend, 60)) is not inside
-    assert not _leaves(18, 20, 10, middle, 2.0 * bend, bend, 1e9)  # the turning point lies outside the used columns
