@@ -161,7 +161,7 @@ def make_surface(
         refinement: what placed them; None if they lie as recorded.
     """
     from orthoswarm.export.value_raster import write_surface  # a fifth of a second that other runs do without
-    from orthoswarm.refine.surface.surface_model import surface_model
+    from orthoswarm.stereo.surface_model import surface_model
 
     path = run.options.surface
     assert path is not None
@@ -175,7 +175,8 @@ def make_surface(
     try:
         with run.clock.stage("final: surface", len(placed)):
             model = surface_model(
-                placed, terrain, state.grid.epsg, config=run.options.config.stereo, run=run.drawers.map,
+                placed, terrain, state.grid.epsg, run.space.scratch("surface"), config=run.options.config.stereo,
+                run=run.drawers.map,
                 progress=partial(run.progress, "matching the surface"),
             )  # fmt: skip
             write_surface(path, model, altitude, common_m)

@@ -62,7 +62,7 @@ class StereoConfig:
     """The surface model (`mosaic --surface`)."""
 
     partners: int = 3
-    """Pictures that measure each place, each compared with four around it; the time grows with it."""
+    """Largest number of partners of each picture; the time grows with it."""
     longest_px: int = 960
     """Larger pictures are reduced by 2, 4 or 8 as long as this many pixels are left on the longer side."""
     depth_m: float = 10.0

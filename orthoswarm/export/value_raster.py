@@ -12,8 +12,9 @@ from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.cog import copy_dataset, software
 from orthoswarm.model.arrays import Floats
 from orthoswarm.model.geo import GroundGrid
-from orthoswarm.model.placement import SurfaceModel, Terrain
+from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.confidence import Confidence
+from orthoswarm.stereo.surface_cells import SurfaceModel
 
 _COG: Final = {
     "driver": "COG", "compress": "deflate", "predictor": "floating_point", "overview_resampling": "average",
@@ -118,7 +119,7 @@ def read_ground(path: Path) -> Terrain:
 def write_surface(
     path: Path, surface: SurfaceModel, takeoff_altitude_m: float | None, common_sigma_m: float | None = None
 ) -> None:
-    """Write a COG, float32: band 1 height, band 2 one sigma, both metres, band 3 number of agreeing measurements.
+    """Write a COG, float32: band 1 height, band 2 one sigma, both metres, band 3 number of agreeing pairs.
 
     The sigma is that of a height against those around. What is wrong with all heights alike stands in its description.
 
@@ -140,7 +141,7 @@ def write_surface(
     bands = {
         f"height of the visible surface over {zero}, metres": surface.height_m + np.float32(takeoff_altitude_m or 0.0),
         f"one sigma of the height against those around, metres; {common}": surface.sigma_m,
-        "measurements that agree": surface.measurements.astype(np.float32),
+        "pairs of pictures that agree": surface.pairs.astype(np.float32),
     }
     tags = {"HEIGHTS_FROM": zero, "VERTICAL_DATUM": _NO_DATUM, "TIFFTAG_SOFTWARE": software()}
     if takeoff_altitude_m is not None:

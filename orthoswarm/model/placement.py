@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.frame import Frame
-from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.task_runner import Run, serial
 
 Array = NDArray[np.float64]
@@ -128,24 +127,6 @@ class Terrain:
         low = z[ri, ci] * (1 - fc) + z[ri, ci + 1] * fc
         high = z[ri + 1, ci] * (1 - fc) + z[ri + 1, ci + 1] * fc
         return np.asarray(low * (1 - fr) + high * fr)
-
-
-@dataclass(frozen=True, slots=True)
-class SurfaceModel:
-    """The visible surface.
-
-    Attributes:
-        grid: its cells.
-        height_m: float32 (rows, columns), over the cameras' zero of heights, NaN where it is not known.
-        sigma_m: float32 (rows, columns), one sigma against the heights around, without what all heights have in common
-            (a wrong focal length moves and stretches them all).
-        measurements: uint8 (rows, columns), how many agree, each by a picture and others around it.
-    """
-
-    grid: GroundGrid
-    height_m: NDArray[np.float32]
-    sigma_m: NDArray[np.float32]
-    measurements: NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

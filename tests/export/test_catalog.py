@@ -22,7 +22,7 @@ from orthoswarm.export.product_files import iso_time, write_frames
 from orthoswarm.export.value_raster import write_surface
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.model.placement import SurfaceModel
+from orthoswarm.stereo.surface_cells import SurfaceModel
 from tests.kit import mosaic_scene
 from tests.kit.scene import Scene, legs
 

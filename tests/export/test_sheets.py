@@ -25,7 +25,7 @@ from orthoswarm.export.tiles.mbtiles import write_mbtiles, write_pmtiles
 from orthoswarm.export.tiles.tile_pyramid import ReducedRaster
 from orthoswarm.export.value_raster import write_surface
 from orthoswarm.model.geo import GroundGrid
-from orthoswarm.model.placement import SurfaceModel
+from orthoswarm.stereo.surface_cells import SurfaceModel
 
 WEST, NORTH, GSD = 465_500.0, 5_249_600.0, 0.25
 FIND = Place(uid="f", kind="find", name="Roof", lat_deg=47.3975, lon_deg=8.5437, time_s=1.78e9, note="</script>")

@@ -1,7 +1,6 @@
 """What vehicles of an area share: which are neighbours, the lean of the map, one terrain."""
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Final
 
 import numpy as np
@@ -10,15 +9,13 @@ from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import STATED_SIGMA_FACTOR, Terrain
 from orthoswarm.model.task_runner import Run, serial
 from orthoswarm.mosaic.extent import ground_of_nearest
-from orthoswarm.refine.bundle.block_arrays import CameraBlock
 from orthoswarm.refine.flight.weakly_held_pictures import weakly_held
 from orthoswarm.refine.registration.block_state import VehicleState
 from orthoswarm.refine.registration.tie_points import MapMatches, vote_lean
 from orthoswarm.refine.surface.dem_surface import LocalDem, fit_over_dem
 from orthoswarm.refine.surface.ground_densification import flying_height
-from orthoswarm.refine.surface.plane_sweep import SweepViews
+from orthoswarm.refine.surface.plane_sweep import SweepViews, with_tall_surfaces
 from orthoswarm.refine.surface.smooth_surface import FitSettings
-from orthoswarm.refine.surface.tall_surfaces import with_tall_surfaces
 from orthoswarm.refine.surface.terrain import fit_terrain
 from orthoswarm.refine.surface.vehicle_ground import TERRAIN_POINTS, ground_points, mapped_ground_level
 from orthoswarm.trajectory.near_paths import near_paths
@@ -79,21 +76,17 @@ def common_terrain(
     height_m = float(np.median([flying_height(s.flight, s.surface) for s in states]))
     surface = np.concatenate([part for s in own for part in (s.dense[0], s.high)])  # ground, and what stands on it
     drawn = with_tall_surfaces(
-        drawn, surface, _sweep_views(states), height_m=height_m, most_nodes=_DRAWN_NODES, run=run
+        drawn, surface, [_sweep_views(s) for s in states], height_m=height_m, most_nodes=_DRAWN_NODES, run=run
     )
     return drawn, _dem_warnings(dem, fit is None, off, states) if dem is not None else []
 
 
-def _sweep_views(states: Sequence[VehicleState]) -> SweepViews:
-    """All vehicles' pictures for the plane sweep, without those that are damaged or weakly held."""
-    cameras, read = [], []
-    for flight in (s.flight for s in states):
-        usable = ~weakly_held(flight)
-        usable[[i for i, frame in enumerate(flight.frames) if frame.damaged or i in flight.pictures.damaged]] = False
-        some = np.flatnonzero(usable)
-        cameras.append(flight.cameras().take(some))
-        read += [partial(flight.pictures.only(i).once, 0) for i in some.tolist()]
-    return SweepViews(CameraBlock.joined(cameras), read)
+def _sweep_views(state: VehicleState) -> SweepViews:
+    """A vehicle's pictures for the plane sweep, without those that are damaged or weakly held."""
+    flight = state.flight
+    usable = ~weakly_held(flight)
+    usable[[i for i, frame in enumerate(flight.frames) if frame.damaged or i in flight.pictures.damaged]] = False
+    return SweepViews(flight.cameras(), flight.pictures, usable)
 
 
 def map_distortion_sigma(states: Sequence[VehicleState]) -> float:

@@ -240,21 +240,17 @@ def _from_rows(cost, gray, levels, aslant, small, low, high, scale, total):  # t
 
 
 @in_place_kernel
-def lowest(total, cost, levels, step, out, own):  # type: ignore[no-untyped-def]
-    """Set out to the height of least total cost of each cell, metres, by a parabola between the heights; 0: the ground.
-
-    own: set to the cell's own cost of that height, 1 or more where some of its heights are not seen.
-    """
+def lowest(total, levels, step, out):  # type: ignore[no-untyped-def]
+    """Set out to the height of least cost of each cell, metres, by a parabola between the heights; 0: the ground."""
     rows, columns = levels.shape
     for r in range(rows):
         for c in range(columns):
             n = levels[r, c]
-            best, seen = 0, True
-            for k in range(n):
-                seen = seen and cost[r, k, c] != _ONE
+            best = 0
+            for k in range(1, n):
                 if total[r, k, c] < total[r, best, c]:
                     best = k
-            out[r, c], own[r, c] = _ZERO, cost[r, best, c] if seen and n > 0 else _ONE
+            out[r, c] = _ZERO
             if best == 0:
                 continue
             shift = _ZERO

@@ -17,7 +17,7 @@ def heights(cost: np.ndarray, gray: np.ndarray) -> np.ndarray:
     out = np.zeros((ROWS, COLUMNS), np.float32)
     f = np.float32
     total = kernels.semi_global(cost, gray, levels, (f(0.15), f(0.3), f(1.2), f(1.0 / 8.0)))
-    kernels.lowest(total, cost, levels, f(1.0), out, np.zeros_like(out))
+    kernels.lowest(total, levels, f(1.0), out)
     return out
 
 

@@ -1,17 +1,15 @@
 """What stands on the ground is drawn where it stands, up to its edges, and the ground beside it on the ground."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 
 from orthoswarm.model.placement import Terrain
 from orthoswarm.model.task_runner import serial
 from orthoswarm.refine.bundle.block_arrays import CameraBlock
+from orthoswarm.refine.features.working_pictures import Pictures
 from orthoswarm.refine.strategy.swarm_refiner import RefinerOptions
-from orthoswarm.refine.surface.plane_sweep import SweepViews
+from orthoswarm.refine.surface.plane_sweep import TALL_FROM_M, SweepViews, with_tall_surfaces
 from orthoswarm.refine.surface.seen_objects import hidden_by
-from orthoswarm.refine.surface.tall_surfaces import TALL_FROM_M, with_tall_surfaces
 from tests.kit.refine import refine_all, through_pickle
 from tests.refine.surface.hall_flight import GRID, HALF, HEIGHT_M, MIDDLE, ROOF_M, HallFlight, away
 
@@ -39,9 +37,9 @@ def raised(roof_m: float = ROOF_M) -> np.ndarray:
 
 
 def drawn(flight: HallFlight, points: np.ndarray, *, usable: object = True, most_nodes: int = MANY) -> Terrain:
-    some = np.flatnonzero(np.full(len(flight.frames), usable, bool))
-    views = SweepViews(flight.cameras.take(some), [partial(flight.read, flight.frames[i]) for i in some])
-    return with_tall_surfaces(GROUND, points, views, height_m=HEIGHT_M, most_nodes=most_nodes, run=serial)
+    count = len(flight.frames)
+    views = SweepViews(flight.cameras, Pictures(flight.frames, flight.read), np.full(count, usable, bool))
+    return with_tall_surfaces(GROUND, points, [views], height_m=HEIGHT_M, most_nodes=most_nodes, run=serial)
 
 
 def test_a_hall_is_drawn_on_its_roof_up_to_the_edges_and_the_ground_beside_it_on_the_ground(flight, places) -> None:
