@@ -146,15 +146,19 @@ def solve_network(graph: PairGraph, records: PhotoRecords, yaw: Array, beliefs: 
     metres = x[at.metres : at.offset]
     q = x[at.offset : at.lens].reshape(2, -1)
     lag = x[at.lag :]
+    position = x[:photos] + 1j * x[photos : 2 * photos]
+    picks = np.zeros((at.size, 2 * at.segments))
+    picks[at.offset + np.arange(2 * at.segments), np.arange(2 * at.segments)] = 1.0
+    variance = np.einsum("ij,ij->j", picks, factor.solve(picks))  # of m o
     return Network(
-        position=x[:photos] + 1j * x[photos : 2 * photos],
+        position=position,
         metres=metres,
         offset=(q[0] + 1j * q[1]) / metres,
-        offset_sigma=_sigmas(factor, at).max(0) / metres,
+        offset_sigma=np.sqrt(np.maximum(variance, 0.0)).reshape(2, -1).max(0) / metres,
         lag=lag,
         pair_ok=_norm(residual[: 2 * pairs]) < NETWORK_GATE_SIGMAS,
         gps_ok=_norm(residual[2 * pairs : 2 * (pairs + photos)]) < NETWORK_GATE_SIGMAS,
-        gps_residual=records.position + lag[records.vehicle] * velocity - (x[:photos] + 1j * x[photos : 2 * photos]),
+        gps_residual=records.position + lag[records.vehicle] * velocity - position,
     )
 
 
@@ -166,14 +170,6 @@ def _norm(residual: Array) -> Array:
 def _robust(residual: Array, c: float) -> Array:
     """Weights of both rows of stacked residual vectors."""
     return np.tile(robust_widening(_norm(residual) ** 2, c) ** -2, 2)
-
-
-def _sigmas(factor: Any, at: _NetworkColumns) -> Array:
-    """One sigma of m o, float64 (2, S), from the factor of the normal equations."""
-    picks = np.zeros((at.size, 2 * at.segments))
-    picks[at.offset + np.arange(2 * at.segments), np.arange(2 * at.segments)] = 1.0
-    variance = np.einsum("ij,ij->j", picks, factor.solve(picks))
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)).reshape(2, -1))
 
 
 def _pair_rows(

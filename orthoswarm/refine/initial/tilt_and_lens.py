@@ -92,14 +92,9 @@ def spaced(count: int, most: int) -> NDArray[np.intp]:
 
 
 def solve_tilt_and_lens(
-    matches: PairMatches,
-    records: PhotoRecords,
-    level: Array,
-    *,
-    log_focal: Array,
-    log_focal_sigma: Array,
+    matches: PairMatches, records: PhotoRecords, level: Array, *, log_focal: Array, log_focal_sigma: Array,
     tilt_sigma: Array,
-) -> TiltAndLens:
+) -> TiltAndLens:  # fmt: skip
     """Find the tilt, focal length and first radial term for which the matches of every pair fit a similarity best.
 
     Args:
