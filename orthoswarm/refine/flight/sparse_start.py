@@ -128,12 +128,9 @@ def read_photo_records(
 
 
 def sparse_start(
-    frames: Sequence[Frame],
-    records: PhotoRecords,
-    read_gray: ReadGray,
-    run: Run = serial,
+    frames: Sequence[Frame], records: PhotoRecords, read_gray: ReadGray, run: Run = serial,
     progress: Progress | None = None,
-) -> SparseStart:
+) -> SparseStart:  # fmt: skip
     """Match photos with each other and find start values; run: executes tasks, the result does not depend on it."""
     builder = PairGraphBuilder(frames=frames, records=records, read_gray=read_gray, run=run, progress=progress)
     start = build_pair_graph(builder)
@@ -155,8 +152,13 @@ def assemble(builder: PairGraphBuilder, records: PhotoRecords, start: InitialOri
     held = np.zeros(len(frames), bool)
     held[np.unique(tracks.camera)] = True
     velocity = records.velocity()
+    below = np.stack([start.position.real, start.position.imag, start.height], axis=1)
+    first = [int(np.argmax(records.lens == k)) for k in range(len(start.focal))]
+    lens = np.zeros((len(start.focal), 8))
+    lens[:, F], lens[:, K1] = start.focal, start.k1
+    lens[:, WIDTH], lens[:, HEIGHT] = records.width[first], records.rows[first]
     return SparseStart(
-        cameras=_camera_block(records, start),
+        cameras=CameraBlock(below, start.rotation(), records.lens.astype(np.int32), lens),
         tracks=tracks,
         position_prior=position,
         position_sigma=sigma,
@@ -172,15 +174,6 @@ def assemble(builder: PairGraphBuilder, records: PhotoRecords, start: InitialOri
         records=records,
         pairs=(len(builder.tried), len(pairs)),
     )
-
-
-def _camera_block(records: PhotoRecords, start: InitialOrientation) -> CameraBlock:
-    position = np.stack([start.position.real, start.position.imag, start.height], axis=1)
-    lens = np.zeros((len(start.focal), 8))
-    first = [int(np.argmax(records.lens == k)) for k in range(len(start.focal))]
-    lens[:, F], lens[:, K1] = start.focal, start.k1
-    lens[:, WIDTH], lens[:, HEIGHT] = records.width[first], records.rows[first]
-    return CameraBlock(position, start.rotation(), records.lens.astype(np.int32), lens)
 
 
 def _position_priors(records: PhotoRecords, start: InitialOrientation) -> tuple[Array, Array, Flags]:
@@ -245,11 +238,10 @@ def group_focal_lengths(log_focal: Array, sigma: Array, sure: Flags) -> Ints:
     for v in sorted(range(len(log_focal)), key=lambda v: (not sure[v], sigma[v])):
         off = np.abs(log_focal[v] - mean)
         near = int(off.argmin()) if len(off) else -1
-        limit = 0.0
-        if near >= 0:
-            total_sigma = float(np.hypot(sigma[v], weight[near] ** -0.5))
-            limit = max(_UNLIKE_SHARE, _UNLIKE_SIGMAS * total_sigma)
-        if near < 0 or (sure[v] and off[near] > limit):
+        limit = np.inf
+        if sure[v] and near >= 0:
+            limit = max(_UNLIKE_SHARE, _UNLIKE_SIGMAS * float(np.hypot(sigma[v], weight[near] ** -0.5)))
+        if near < 0 or off[near] > limit:
             group[v] = len(mean)
             weight, mean = np.append(weight, sigma[v] ** -2), np.append(mean, log_focal[v])
             continue
