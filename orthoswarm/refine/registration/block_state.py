@@ -112,12 +112,12 @@ def lies_on_map(state: VehicleState) -> bool:
 
 def findings(state: VehicleState) -> list[str]:
     """Warnings about a vehicle: findings of its records, and how it was registered."""
+    shift = state.coarse_shift
     if state.carried:
         return [*state.flight.warnings, CARRIED]
-    if state.coarse_shift is not None:
-        shift = state.coarse_shift
+    if shift is not None:
         return [*state.flight.warnings, SHIFTED.format(gsd_m=shift.gsd_m, sigma_m=shift.sigma_m)]
-    return [*state.flight.warnings, NOT_FOUND] if state.had_map and not state.on_map else list(state.flight.warnings)
+    return [*state.flight.warnings, *([NOT_FOUND] if state.had_map and not state.on_map else [])]
 
 
 class Stopwatch:
@@ -140,14 +140,9 @@ class Stopwatch:
 
 
 def to_solution(
-    state: VehicleState,
-    origin: Array,
-    terrain: Terrain | None,
-    *,
-    coarse: bool = False,
-    map_lean: tuple[float, float] = (0.0, 0.0),
-    ground_z_m: float = 0.0,
-) -> Solution:
+    state: VehicleState, origin: Array, terrain: Terrain | None, *, coarse: bool = False,
+    map_lean: tuple[float, float] = (0.0, 0.0), ground_z_m: float = 0.0,
+) -> Solution:  # fmt: skip
     """The state as a Solution on the area's grid (full-resolution lenses); coarse takes the cameras before the map."""
     flight = state.flight
     cameras = full_resolution(state.coarse if coarse else flight.adjustment.cameras, flight)
@@ -157,24 +152,21 @@ def to_solution(
     weak = weakly_held(flight)
     placed = [
         PlacedFrame(
-            frame,
-            cameras.camera(i, origin),
-            stage,
-            float(sigma[i]),
-            bool(weak[i]),
+            frame, cameras.camera(i, origin), stage, float(sigma[i]), bool(weak[i]),
             pose_covariance=None if covariance is None else covariance[i],
         )
         for i, frame in enumerate(flight.frames)
         if i not in flight.pictures.damaged
-    ]
-    dropped = {flight.frames[i].image: reason for i, reason in flight.pictures.damaged.items()}
-    fov = fov_rad(flight.focal_px, flight.pictures.size[0])
+    ]  # fmt: skip
+    points, _ = ground_points(flight.adjustment)
+    heights = flight.cameras().position[:, 2]  # of one state with the points, also where `cameras` are those before
+    above_m = heights.mean() - points[:, 2].mean() if len(points) else np.nan
     return Solution(
         vehicle=state.vehicle,
         placed=placed,
-        dropped=dropped,
+        dropped={flight.frames[i].image: reason for i, reason in flight.pictures.damaged.items()},
         legs=leg_states(state),
-        fov_deg=float(np.degrees(fov)),
+        fov_deg=float(np.degrees(fov_rad(flight.focal_px, flight.pictures.size[0]))),
         fov_sigma_deg=state.fov_sigma_deg,
         terrain=terrain,
         ground_z_m=ground_z_m,
@@ -182,18 +174,9 @@ def to_solution(
         state=state,
         warnings=findings(state),
         timings=dict(state.timings),
-        gsd_m=_mean_gsd(cameras, flight),
+        gsd_m=float(above_m / cameras.lens[0, F]),
         false_matches=state.false_matches,
     )
-
-
-def _mean_gsd(cameras: CameraBlock, flight: FlightBlock) -> float:
-    """Mean height above the ground's points over the focal length (cameras: full resolution), metres a pixel."""
-    points, _ = ground_points(flight.adjustment)
-    if not len(points):
-        return float("nan")
-    heights = flight.cameras().position[:, 2]  # of one state with the points, also where `cameras` are those before
-    return float((heights.mean() - points[:, 2].mean()) / cameras.lens[0, F])
 
 
 def full_resolution(cameras: CameraBlock, flight: FlightBlock) -> CameraBlock:

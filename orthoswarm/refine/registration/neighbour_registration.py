@@ -109,17 +109,9 @@ def link_to_fixed(
         return flight.pictures.gray(i) if i < n else fixed.gray(i - n)
 
     camera, point, uv = link_legs(
-        joint,
-        adj.points,
-        chosen,
-        camera=seen.camera,
-        leg=leg,
-        candidates=candidates,
-        gray=gray,
-        gsd_m=gsd_m,
-        most=_NEIGHBOUR_PICTURES,
-        reach=reach_px,
-    )
+        joint, adj.points, chosen, camera=seen.camera, leg=leg, candidates=candidates, gray=gray, gsd_m=gsd_m,
+        most=_NEIGHBOUR_PICTURES, reach=reach_px,
+    )  # fmt: skip
     if not len(camera):
         return 0
     tracks = adj.tracks.with_more(camera, point, uv, _NEIGHBOUR_SIGMA_PX)

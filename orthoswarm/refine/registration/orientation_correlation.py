@@ -34,7 +34,7 @@ _STRIP_FARTHEST_M: Final = 50.0  # ... and this
 STRIP_MAP_SHARE: Final = 0.1  # least share of a strip's search area that the map covers
 _STRIP_BLUR_PX: Final = 0.7  # sigma of the blur before the gradients
 STRIP_FEWEST_EDGES: Final = 400  # fewer pixels with an orientation, in the strip or on the map, show nothing
-STRIP_BORDER_PX: Final = 5  # side of the square by which the valid part is eroded: gradients at its edge are artefacts
+_STRIP_BORDER_PX: Final = 5  # side of the square by which the valid part is eroded: gradients at its edge are artefacts
 _ENERGY_SHARE: Final = 0.05  # least energy of the map under a shift, as a share of the largest
 PEAK_APART_PX: Final = 4  # correlations within this distance, pixels, belong to the same peak
 _STACK_BLUR_PX: Final = 2.0
@@ -59,16 +59,19 @@ class Match:
     ratio: float
 
 
+def edges_of(gray: Floats, valid: Flags) -> tuple[OrientationField, Floats, Flags]:
+    """Gradients gx + i gy, their lengths, and where they are no artefact of the valid part's edge."""
+    side = np.ones((_STRIP_BORDER_PX, _STRIP_BORDER_PX), np.uint8)
+    gradient = cv2.Sobel(gray, cv2.CV_32F, 1, 0) + 1j * cv2.Sobel(gray, cv2.CV_32F, 0, 1)
+    return gradient, np.abs(gradient), cv2.erode(valid.astype(np.uint8), side, borderValue=0).astype(bool)
+
+
 def orientation_field(gray: Floats, valid: Flags) -> OrientationField:
     """Double-angle orientation field (gx + i gy)^2 / |g|^2 * |g| / (|g| + median |g|), 0 where not valid.
 
     An edge keeps its value when light and dark change places.
     """
-    side = STRIP_BORDER_PX
-    gx, gy = cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)
-    inner = cv2.erode(valid.astype(np.uint8), np.ones((side, side), np.uint8), borderValue=0).astype(bool)
-    g = gx + 1j * gy
-    size = np.abs(g)
+    g, size, inner = edges_of(gray, valid)
     middle = float(np.median(size[inner])) if inner.any() else 1.0
     return np.asarray(np.where(inner, g * g / (np.maximum(size, 1e-3) * (size + max(middle, 1e-3))), 0), np.complex64)
 
@@ -222,14 +225,9 @@ def on_map(mosaic: Mosaic, search: Search) -> Strip | None:
         return None
     grid = GroundGrid.around(basemap.epsg, bounds, gsd_m)
     return Strip(
-        gray=gray,
-        valid=valid,
-        ground=ground,
-        known=known,
-        reach=reach,
-        gsd_m=gsd_m,
+        gray=gray, valid=valid, ground=ground, known=known, reach=reach, gsd_m=gsd_m,
         offset=(grid.west - bounds[0], grid.north - bounds[3]),
-    )
+    )  # fmt: skip
 
 
 def by_edges(strip: Strip) -> Found | None:
@@ -287,12 +285,9 @@ def by_learning(strip: Strip, device: str) -> Found | None:
 
 
 def register(
-    cameras: CameraBlock,
-    index: NDArray[np.integer],
-    picture: Callable[[int], Gray],
-    search: Search,
+    cameras: CameraBlock, index: NDArray[np.integer], picture: Callable[[int], Gray], search: Search,
     find: Callable[[Strip], Found | None] = by_edges,
-) -> Match | None:
+) -> Match | None:  # fmt: skip
     """Find the mosaic of some consecutive pictures on the map; None where there is nothing to find."""
     strip = strip_and_map(cameras, index, picture, search)
     found = None if strip is None else find(strip)
