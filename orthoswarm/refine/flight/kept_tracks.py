@@ -27,13 +27,11 @@ class Followed:
 
     Attributes:
         calibration: focal length and headings by the flow. tracks: corners that were tracked, in working pixels.
-        survived: float64 (N,), share of the tracks that survived into each picture.
         small: index -> reduced picture. damaged: index -> why that picture cannot be used.
     """
 
     calibration: Calibration
     tracks: Tracks
-    survived: Array
     small: dict[int, Gray]
     damaged: dict[int, str]
 

@@ -1,6 +1,6 @@
-"""Messages for the report: contradictions between pictures and records, and reasons why photos were not placed."""
+"""Messages for the report: contradictions between pictures and records."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -19,7 +19,6 @@ _TILT_DIFFERENCE_DEG: Final = 2.0  # a larger difference of recorded tilts is re
 _TILT_DIFFERENCE_SIGMAS: Final = 3.0  # ... if it exceeds so many of its sigmas
 _ONE_WAY_LENGTH: Final = 0.9  # mean unit vector of headings from which a tilt is like a slope of the ground
 _SLOPE_DEG: Final = 6.0  # then a difference of tilts is reported only above this
-_OBLIQUE_DEG: Final = 35.0  # a photo tilted more that matches no other is reported as oblique
 _HEIGHT_DIFFERENCE_SHARE: Final = 0.15  # a recorded height that differs by more is reported, as a share
 _HEIGHT_DIFFERENCE_SIGMAS: Final = 4.0  # ... and by more than so many sigmas of the focal length
 _LEAST_HEIGHT_M: Final = 2.0  # a recorded height below this cannot be meant and is reported
@@ -36,20 +35,6 @@ def findings(frames: Sequence[Frame], records: PhotoRecords, start: InitialOrien
     if parts > 1:
         found.append(f"the photos fall into {parts} parts without overlap; each lies in the frame of its own positions")
     return found
-
-
-def unplaced_reasons(
-    frames: Sequence[Frame], records: PhotoRecords, placed: Flags, damaged: Mapping[int, str]
-) -> dict[int, str]:
-    """Reasons why photos have no tie points to others."""
-    reasons = dict(damaged)
-    for k in np.flatnonzero(~placed).tolist():
-        tilt = float(np.degrees(records.pitch[k])) + 90.0
-        why = "matches no other photo; it is placed by its tags alone"
-        if tilt > _OBLIQUE_DEG:
-            why = f"looks {tilt:.0f} degrees off nadir and matches no other photo"
-        reasons.setdefault(k, f"{frames[k].image} {why}")
-    return reasons
 
 
 def runs(names: Sequence[str], flags: Flags) -> str:

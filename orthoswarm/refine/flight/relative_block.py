@@ -79,7 +79,6 @@ class FlightBlock:
     Attributes:
         frames: in order. records: their records (headings already corrected). leg: int32 (N,).
         pictures: grey pictures. calibration: first guess. adjustment: the cameras and points.
-        survived: float64 (N,), share of tracks that survived into each picture.
         warnings: for the report. sparse: True if photos were matched in pairs instead of tracked.
         focal_sigma: relative sigma of a focal length found together with other vehicles and fixed since (else 0).
     """
@@ -90,7 +89,6 @@ class FlightBlock:
     pictures: Pictures
     calibration: Calibration
     adjustment: Adjustment
-    survived: Array
     warnings: list[str]
     sparse: bool = False
     focal_sigma: float = 0.0
@@ -111,10 +109,19 @@ class FlightBlock:
 
     def best_views(self, some: Flags | None = None) -> BestViews:
         """Best view of each tie point, chosen among the vehicle's own pictures, or among some (N,) of them."""
-        adj = self.adjustment
+        adj, n = self.adjustment, len(self.adjustment.points)
+        camera, point, weight = adj.tracks.camera, adj.tracks.point, adj.obs_weight
         own = np.zeros(len(adj.cameras), bool)
         own[: len(self.frames)] = True if some is None else some
-        return best_views(adj.cameras, adj.tracks, adj.points, adj.obs_weight, own)
+        inlier = weight > INLIER_WEIGHT
+        usable = inlier & own[camera]
+        distance = np.hypot(*(adj.cameras.position[camera, :2] - adj.points[point, :2]).T)
+        order = np.lexsort((np.where(usable, distance, np.inf), point))
+        best = order[np.minimum(np.searchsorted(point[order], np.arange(n)), len(order) - 1)]
+        total = np.bincount(point, minlength=n)
+        shown = np.where((total > 0) & usable[best], camera[best], -1).astype(np.int32)
+        count = np.bincount(point[inlier], minlength=n).astype(np.int32)
+        return BestViews(shown, count, np.bincount(point, weight, minlength=n) / np.maximum(total, 1))
 
     def one_per_cell(self, seen: BestViews, usable: Flags, cost: Array | Ints, cell_m: float) -> Indices:
         """The usable point of least cost in each ground cell of each leg, of those seen: indices, sorted."""
@@ -164,7 +171,6 @@ def open_flight(
         pictures=pictures,
         calibration=calibration,
         adjustment=_begin(records, pictures, calibration, followed.tracks),
-        survived=followed.survived,
         warnings=list(calibration.warnings),
     )
 
@@ -185,13 +191,10 @@ def _follow(records: FlightRecords, leg: Ints, pictures: Pictures, fov_start: fl
         return bool(broken or np.median(survived[1:]) < _FOLLOWED_SURVIVAL)
 
     turned = replace(records, yaw=records.yaw + calibration.yaw_offset)
-    found = _track(turned, pictures, calibration, hopeless)
-    if found is None or found[0].count < _FOLLOWED_TRACKS_FACTOR * len(records.position) ** 0.5:
+    tracks = _track(turned, pictures, calibration, hopeless)
+    if tracks is None or tracks.count < _FOLLOWED_TRACKS_FACTOR * len(records.position) ** 0.5:
         return None
-    return Followed(
-        calibration=calibration, tracks=found[0], survived=found[1], small=pictures.reduced(),
-        damaged=dict(pictures.damaged),
-    )  # fmt: skip
+    return Followed(calibration=calibration, tracks=tracks, small=pictures.reduced(), damaged=dict(pictures.damaged))
 
 
 def weigh_records(flight: FlightBlock) -> None:
@@ -238,8 +241,8 @@ def _step_sigma(values: Array) -> Array:
 
 def _track(
     records: FlightRecords, pictures: Pictures, calibration: Calibration, hopeless: Callable[[Array], bool]
-) -> tuple[Tracks, Array] | None:
-    """The tracks and the share that survived into each picture, 1 to begin with; None once these are hopeless."""
+) -> Tracks | None:
+    """Tracks; None once the shares of them that survived into each picture, 1 to begin with, are hopeless."""
     rotation, steps = records.rotation(), records.steps()
     width, height = pictures.size
     f, height_m = calibration.focal_px, calibration.height_m
@@ -255,7 +258,7 @@ def _track(
         survived[i] = tracker.add(i, pictures.gray(i), predicted)
         if hopeless(survived):
             return None
-    return tracker.tracks(), survived
+    return tracker.tracks()
 
 
 def _begin(records: FlightRecords, pictures: Pictures, calibration: Calibration, tracks: Tracks) -> Adjustment:
@@ -361,22 +364,3 @@ def _median_angle(angle: Array) -> float:
     far = np.abs(wrap_rad(angle[:, None] - angle)).sum(axis=1)
     first = angle[int(far.argmin())]
     return float(wrap_rad(first + np.median(wrap_rad(angle - first))))
-
-
-def best_views(
-    cameras: CameraBlock, tracks: Tracks, points: Array, obs_weight: Array, own: Flags | None = None
-) -> BestViews:
-    """Best view of each point; `own` bool (N,) limits the choice of camera."""
-    n = len(points)
-    distance = np.hypot(*(cameras.position[tracks.camera, :2] - points[tracks.point, :2]).T)
-    usable = obs_weight > INLIER_WEIGHT
-    count = np.bincount(tracks.point[usable], minlength=n)
-    if own is not None:
-        usable &= own[tracks.camera]
-    order = np.lexsort((np.where(usable, distance, np.inf), tracks.point))
-    first = np.searchsorted(tracks.point[order], np.arange(n))
-    best = order[np.minimum(first, len(order) - 1)]
-    total = np.bincount(tracks.point, minlength=n)
-    ok = (total > 0) & usable[best]
-    weight = np.bincount(tracks.point, obs_weight, minlength=n) / np.maximum(total, 1)
-    return BestViews(np.where(ok, tracks.camera[best], -1).astype(np.int32), count.astype(np.int32), weight)

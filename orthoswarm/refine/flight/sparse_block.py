@@ -44,41 +44,28 @@ def open_sparse_flight(frames: Sequence[Frame], grid: LocalGrid, origin: Array, 
     return open_sparse_flights([frames], grid, origin, read)[0]
 
 
-def make_flight(
-    frames: Sequence[Frame],
-    grid: LocalGrid,
-    origin: Array,
-    read: ReadGray,
-    *,
-    start: SparseStart,
-    rows: Indices,
-    adjustment: Adjustment,
-    trusted_height: Flags,
-    warnings: Sequence[str],
-    focal_sigma: float = 0.0,
-) -> FlightBlock:
-    """Make a vehicle's flight from photos adjusted alone or with others.
+def _flight(
+    frames: Sequence[Frame], grid: LocalGrid, origin: Array, read: ReadGray, *, start: SparseStart, rows: Indices,
+    adjustment: Adjustment, trusted_height: Flags, warnings: list[str], focal_sigma: float,
+) -> FlightBlock:  # fmt: skip
+    """A vehicle's flight from photos adjusted alone or with others.
 
-    Args:
-        start: of all photos that were matched together. rows: which of them are the vehicle's.
-        adjustment: of the vehicle's photos alone, in pixels of the full pictures.
-        trusted_height: bool, of all photos, True where the final adjustment used the recorded height.
-        warnings: for the report of this vehicle. focal_sigma: see `FlightBlock`.
+    start, trusted_height: of all photos that were matched together; rows: which of them are the vehicle's. adjustment:
+    of its photos alone, in pixels of the full pictures.
     """
     records = flight_records.read_records(frames, grid, origin)
     pictures = Pictures(frames, read)
     adjustment = in_reduced_pixels(adjustment, pictures.scale, pictures.size)
     number = {int(row): k for k, row in enumerate(rows)}
-    pictures.damaged.update({number[k]: start.reasons[k] for k in sorted(start.damaged) if k in number})
+    pictures.damaged.update({number[k]: start.damaged[k] for k in sorted(start.damaged) if k in number})
     yaw = wrap_rad(start.plane.yaw[rows])
-    mine = list(warnings)
     calibration = Calibration(
         focal_px=float(adjustment.cameras.lens[0, F]),
         height_m=float(np.median(adjustment.cameras.position[:, 2] - adjustment.ground_m)),
         yaw_offset=wrap_rad(yaw - records.yaw),
         trusted_height=bool(trusted_height[rows].any()),
         pairs=start.pairs[1],
-        warnings=mine,
+        warnings=warnings,
     )
     leg = photo_legs(start.plane.position[rows], start.records.segment[rows], start.records.time_s[rows])
     return FlightBlock(
@@ -88,8 +75,7 @@ def make_flight(
         pictures=pictures,
         calibration=calibration,
         adjustment=adjustment,
-        survived=start.placed[rows].astype(np.float64),
-        warnings=list(mine),
+        warnings=list(warnings),
         sparse=True,
         focal_sigma=focal_sigma,
     )
@@ -115,14 +101,9 @@ def in_reduced_pixels(adjustment: Adjustment, step: float, size: tuple[int, int]
 
 
 def open_sparse_flights(
-    units: Sequence[Sequence[Frame]],
-    grid: LocalGrid,
-    origin: Array,
-    read: ReadGray,
-    *,
-    run: Run = serial,
+    units: Sequence[Sequence[Frame]], grid: LocalGrid, origin: Array, read: ReadGray, *, run: Run = serial,
     progress: Progress | None = None,
-) -> list[FlightBlock]:
+) -> list[FlightBlock]:  # fmt: skip
     """Match the photos of one or several vehicles with each other and adjust them together, without a map.
 
     units: frames of one vehicle and one lens each, in order of time. Returns a flight for each, whose adjustment
@@ -151,7 +132,7 @@ def open_sparse_flights(
         first += len(part)
         alone = _extract_block(adjustment, start, rows) if len(units) > 1 else adjustment
         flights.append(
-            make_flight(
+            _flight(
                 part, grid, origin, read, start=start, rows=rows, adjustment=alone, trusted_height=trusted,
                 warnings=warnings, focal_sigma=float(focal_sigma[rows[0]]),
             )

@@ -22,7 +22,7 @@ from orthoswarm.refine.bundle.block_arrays import HEIGHT, K1, WIDTH, CameraBlock
 from orthoswarm.refine.bundle.flight_records import column
 from orthoswarm.refine.features.pair_matching import build_tracks, thin_tracks
 from orthoswarm.refine.features.working_pictures import ReadGray
-from orthoswarm.refine.flight.record_findings import findings, unplaced_reasons
+from orthoswarm.refine.flight.record_findings import findings
 from orthoswarm.refine.initial.initial_orientation import InitialOrientation, find_initial_orientation
 from orthoswarm.refine.initial.pair_graph import PairGraphBuilder, build_pair_graph
 from orthoswarm.refine.initial.planar_network import LAG_SPREAD_S
@@ -60,8 +60,7 @@ class SparseStart:
         position_sigma: float64 (N, 3), one sigma east, north, up. height_known: bool (N,), whether heights are recorded
             and possible. velocity: float64 (N, 2), metres per second.
         log_focal: float64 (L,) by the tags (75 degrees without), pixels. log_focal_sigma: float64 (L,).
-        placed: bool (N,), False where a photo has no tie points to others. reasons: photo -> why not.
-        damaged: photos that cannot be decoded.
+        damaged: photos that cannot be used, and why.
         warnings: for the report. plane: the planar start values.
         records: what the photos recorded. pairs: pairs tried and matched.
     """
@@ -74,9 +73,7 @@ class SparseStart:
     velocity: Array
     log_focal: Array
     log_focal_sigma: Array
-    placed: Flags
-    reasons: dict[int, str]
-    damaged: frozenset[int]
+    damaged: dict[int, str]
     warnings: list[str]
     plane: InitialOrientation
     records: PhotoRecords
@@ -149,8 +146,6 @@ def assemble(builder: PairGraphBuilder, records: PhotoRecords, start: InitialOri
     tracks = thin_tracks(build_tracks(builder.features, trusted), records.width, records.rows)
     position, sigma, known = _position_priors(records, start)
     log_focal, log_focal_sigma = focal_by_hint(records)
-    held = np.zeros(len(frames), bool)
-    held[np.unique(tracks.camera)] = True
     velocity = records.velocity()
     below = np.stack([start.position.real, start.position.imag, start.height], axis=1)
     first = [int(np.argmax(records.lens == k)) for k in range(len(start.focal))]
@@ -166,9 +161,7 @@ def assemble(builder: PairGraphBuilder, records: PhotoRecords, start: InitialOri
         velocity=np.stack([velocity.real, velocity.imag], axis=1),
         log_focal=log_focal,
         log_focal_sigma=log_focal_sigma,
-        placed=held,
-        reasons=unplaced_reasons(frames, records, held, builder.damaged),
-        damaged=frozenset(builder.damaged),
+        damaged=dict(builder.damaged),
         warnings=findings(frames, records, start),
         plane=start,
         records=records,
