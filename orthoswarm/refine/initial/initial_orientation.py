@@ -46,7 +46,6 @@ _FOCAL_CHANGE: Final = 0.03  # a focal length by height that differs by more is 
 _ROUNDS: Final = 2  # rounds of shapes, headings, scales and network (a third changed nothing)
 _LINK_SIGMA: Final = 0.15  # relative sigma of a segment's ground scale about its lens's
 _LINK_HEIGHT_SIGMA: Final = 0.03  # the same where recorded heights scale it
-_LENS_SCALE_SIGMA: Final = 0.5  # relative sigma of a lens's ground scale
 _COURSE_LEAST_M_S: Final = 0.3  # slower photos have no course for a heading
 
 
@@ -130,9 +129,13 @@ def find_initial_orientation(
         yaw, yaw_known = solve_headings(graph, component, yaw, course, sigma)
         link, link_sigma = _links(heights, lens_of, by_height)
         priors = NetworkPriors(
-            metres=metres, relief=relative, link=link, link_sigma=link_sigma, metres_sigma=_LENS_SCALE_SIGMA,
-            offset_sigma=tilt_px, lens=lens_of,
-        )  # fmt: skip
+            metres=metres,
+            relief=relative,
+            link=link,
+            link_sigma=link_sigma,
+            offset_sigma=tilt_px,
+            lens=lens_of,
+        )
         network = solve_network(graph, records, yaw, priors)
         metres = network.metres
     level = shape.level.copy()

@@ -26,6 +26,7 @@ _PAIR_SIGMA_M: Final = 0.6  # sigma of a pair's vector
 _PAIR_SIGMA_SHARE: Final = 0.05  # ... and this share of the distance of its matches from the nadirs
 LAG_SPREAD_S: Final = 0.3  # scatter of the delay of recorded positions along the way
 _NETWORK_STILL_M_S: Final = 0.1  # a slower vehicle has no direction along the way
+_LENS_SCALE_SIGMA: Final = 0.5  # relative sigma of a lens's ground scale
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,7 +37,6 @@ class NetworkPriors:
         metres: float64 (S,), metres per pixel. relief: float64 (N,), factor on it for each photo (the photo's height
             over its segment's).
         link: float64 (S,), metres per pixel of a segment over its lens's; link_sigma: float64 (S,), relative sigma.
-        metres_sigma: relative sigma of each lens's metres per pixel.
         offset_sigma: float64 (S,), pixels, of the nadir's offset from 0.
         lens: int32 (S,), lens of each segment.
     """
@@ -45,7 +45,6 @@ class NetworkPriors:
     relief: Array
     link: Array
     link_sigma: Array
-    metres_sigma: float
     offset_sigma: Array
     lens: Ints
 
@@ -86,12 +85,6 @@ class _NetworkColumns(NamedTuple):
     lag: int
     size: int
 
-    @classmethod
-    def of(cls, n: int, s: int, lenses: int, v: int) -> "_NetworkColumns":
-        """The columns for so many photos, segments, lenses and vehicles."""
-        first = np.cumsum([2 * n, s, 2 * s, lenses, v]).tolist()
-        return cls(n, s, lenses, v, *first)
-
 
 @dataclass(slots=True)
 class SparseRows:
@@ -122,9 +115,8 @@ class SparseRows:
 
 def solve_network(graph: PairGraph, records: PhotoRecords, yaw: Array, beliefs: NetworkPriors) -> Network:
     """Solve positions, scale, nadir offset and lag of N photos; yaw: float64 (N,), their headings."""
-    at = _NetworkColumns.of(
-        len(records), len(beliefs.metres), int(beliefs.lens.max()) + 1, int(records.vehicle.max()) + 1
-    )
+    n, s, lenses, v = len(records), len(beliefs.metres), int(beliefs.lens.max()) + 1, int(records.vehicle.max()) + 1
+    at = _NetworkColumns(n, s, lenses, v, *np.cumsum([2 * n, s, 2 * s, lenses, v]).tolist())
     rows = SparseRows(at.size)
     _pair_rows(rows, at, graph, records=records, unit=np.exp(-1j * yaw), b=beliefs)
     velocity = _gps_rows(rows, at, records)
@@ -220,5 +212,5 @@ def _prior_rows(rows: SparseRows, at: _NetworkColumns, b: NetworkPriors) -> None
     for part in (0, at.segments):
         rows.add(np.zeros(at.segments), (at.offset + part + segment, 1.0 / (b.offset_sigma * b.metres)))
     expected = np.array([np.median((b.metres / b.link)[b.lens == k]) for k in range(at.lenses)])
-    rows.add(np.full(at.lenses, 1.0 / b.metres_sigma), (at.lens + lens, 1.0 / (b.metres_sigma * expected)))
+    rows.add(np.full(at.lenses, 1.0 / _LENS_SCALE_SIGMA), (at.lens + lens, 1.0 / (_LENS_SCALE_SIGMA * expected)))
     rows.add(np.zeros(at.vehicles), (at.lag + vehicle, 1.0 / LAG_SIGMA_S))

@@ -99,15 +99,9 @@ def load_map(flight: FlightBlock, basemap: MapWindow, origin: Array, gsd_m: floa
 
 
 def tie_matches(
-    flight: FlightBlock,
-    surface: GroundModel,
-    ground: LoadedMap,
-    *,
-    cell_m: float,
-    reach_m: float,
-    half_m: float | None = None,
-    pictures: Flags | None = None,
-) -> MapMatches:
+    flight: FlightBlock, surface: GroundModel, ground: LoadedMap, *, cell_m: float, reach_m: float,
+    half_m: float | None = None, pictures: Flags | None = None,
+) -> MapMatches:  # fmt: skip
     """Sure matches of ground points, one for each cell and leg, with the map.
 
     Ground is compared by its texture: strong edges belong to what leans and casts shadows.
