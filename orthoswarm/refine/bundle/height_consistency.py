@@ -81,10 +81,9 @@ def release_heights(adjustment: Adjustment) -> Flags:
 class FreeHeight:
     """What the adjustment of one vehicle came to without its recorded heights.
 
-    Attributes:
-        focal_px: focal length after each of the last steps.
-        recorded_m: median recorded height above the takeoff point. solved_m: median height above the solved ground.
-        predicted: difference of the two that `predicted_height_offset` expected, and its tolerance, metres.
+    focal_px: focal length after each of the last steps. recorded_m: median recorded height above the takeoff point.
+    solved_m: median height above the solved ground. predicted: difference of the two that `predicted_height_offset`
+    expected, and its tolerance, metres.
     """
 
     focal_px: Sequence[float]

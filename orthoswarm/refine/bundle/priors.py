@@ -29,11 +29,9 @@ _ATTITUDE_ROBUST_C: Final = 25.0  # robust scale of recorded attitudes, squared 
 class GroupPriors:
     """Sigmas of the errors common to all frames of a group (a vehicle's sortie); SI units and radians.
 
-    Attributes:
-        bias_sigma: attitude bias about the camera's x, y, z axes. height_sigma: common offset of recorded heights.
-        lag_sigma: delay of the recorded position (0 switches it off).
-        drift_sigma: size of the receiver's drift (0 switches it off); drift_bend: second difference of its knots;
-            knot_every: frames between knots.
+    bias_sigma: attitude bias about the camera's x, y, z axes. height_sigma: common offset of recorded heights.
+    lag_sigma: delay of the recorded position; drift_sigma: size of the receiver's drift (0 switches them off).
+    drift_bend: second difference of the drift's knots; knot_every: frames between knots.
     """
 
     bias_sigma: tuple[float, float, float] = tuple(np.radians(ATTITUDE_BIAS_SIGMA_DEG))

@@ -25,9 +25,8 @@ _MOST_KEPT: Final = 8  # stretches whose tracks are kept for a refinement that f
 class Followed:
     """What was measured in the pictures of a flight (N) from one to the next.
 
-    Attributes:
-        calibration: focal length and headings by the flow. tracks: corners that were tracked, in working pixels.
-        small: index -> reduced picture. damaged: index -> why that picture cannot be used.
+    calibration: focal length and headings by the flow. tracks: corners that were tracked, in working pixels.
+    small: index -> reduced picture. damaged: index -> why that picture cannot be used.
     """
 
     calibration: Calibration

@@ -62,9 +62,8 @@ INLIER_WEIGHT: Final = 0.5  # an observation counts as an inlier from this robus
 class BestViews:
     """For each point the inlier observation nearest to its camera's nadir, and the quality of the point's observations.
 
-    Attributes (P points):
-        camera: int32 (P,), of that observation, -1 where there is none. count: int32 (P,), inlier observations.
-        mean_weight: float64 (P,), mean robust weight.
+    camera: int32 (P,), of that observation, -1 where there is none. count: int32 (P,), inlier observations.
+    mean_weight: float64 (P,), mean robust weight.
     """
 
     camera: Ints
@@ -139,13 +138,11 @@ def open_flight(
 ) -> FlightBlock | None:  # fmt: skip
     """Track corners through a vehicle's pictures, in order, and set up its adjustment, without solving it.
 
-    Args:
-        fov_start: assumed horizontal field of view, radians. kept: where the tracks are kept, and found again.
+    fov_start: assumed horizontal field of view, radians. kept: where the tracks are kept, and found again.
 
-    Returns:
-        None where pictures are matched in pairs instead (see `open_sparse_flight`): too little overlap, a height that
-        contradicts the scale, or, where no height was recorded, a chain that breaks, or a single straight line, on
-        which drift and scale cannot be separated.
+    Returns None where pictures are matched in pairs instead (see `open_sparse_flights`): too little overlap, a height
+    that contradicts the scale, or, where no height was recorded, a chain that breaks, or a single straight line, on
+    which drift and scale cannot be separated.
     """
     if len(frames) < _FOLLOWED_PHOTOS:
         return None

@@ -65,8 +65,11 @@ def solve_sparse(start: SparseStart) -> Adjustment:
     for k, (c, steps) in enumerate(schedule):  # the first stage fixes the lens and assumes level ground
         if k == 1:
             _free_lens(adjustment, start, full=False)
-        if k >= 2:
-            _widen_position_sigmas(adjustment)
+        if k >= 2:  # positions and heights that scatter more than stated: too small sigmas push the cameras up
+            p = adjustment.priors
+            off = adjustment.position_residuals() / np.maximum(p.position_sigma, 1e-9)
+            across, up = max(mad_sigma(off[:, :2]), 1.0), max(mad_sigma(off[:, 2]), 1.0)
+            adjustment.priors = replace(p, position_sigma=p.position_sigma * [across, across, up])
         if k == len(schedule) - 1:  # k3 and principal point, too, of lenses with enough observations
             _attitude_sigmas_from_residuals(adjustment)
             _free_lens(adjustment, start, full=True)
@@ -154,15 +157,6 @@ def _free_lens(adjustment: Adjustment, start: SparseStart, *, full: bool) -> Non
     now = p.lens + adjustment.common[: 6 * lenses].reshape(-1, 6)
     adjustment.common[: 6 * lenses] = (now - lens).ravel()
     adjustment.priors = replace(p, lens=lens, lens_sigma=sigma)
-
-
-def _widen_position_sigmas(adjustment: Adjustment) -> None:
-    """Widen sigmas of positions and heights that scatter more than stated; too small ones push the cameras up."""
-    p = adjustment.priors
-    off = adjustment.position_residuals() / np.maximum(p.position_sigma, 1e-9)
-    horizontal = mad_sigma(off[:, :2])
-    scatter = np.array([horizontal, horizontal, mad_sigma(off[:, 2])])
-    adjustment.priors = replace(p, position_sigma=p.position_sigma * np.maximum(scatter, 1.0))
 
 
 def _attitude_sigmas_from_residuals(adjustment: Adjustment) -> None:

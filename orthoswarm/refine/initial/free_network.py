@@ -53,10 +53,9 @@ class Anchors:
 class FreeNetwork:
     """N photos on the ground.
 
-    Attributes:
-        scale: complex (N,), a of each photo: metres per pixel times exp(-i yaw). centre: complex (N,), t: below the
-            camera. sigma_m: float64 (N,), one sigma of the centre, an axis. placed: bool (N,).
-        left: photos that pairs connect, but that could not be placed, the largest part first.
+    scale: complex (N,), a of each photo: metres per pixel times exp(-i yaw). centre: complex (N,), t: below the camera.
+    sigma_m: float64 (N,), one sigma of the centre, an axis. placed: bool (N,). left: photos that pairs connect but that
+    could not be placed, the largest part first.
     """
 
     scale: Complex

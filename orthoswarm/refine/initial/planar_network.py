@@ -53,10 +53,9 @@ class NetworkPriors:
 class Network:
     """Result of the network.
 
-    Attributes:
-        position: complex (N,). metres: float64 (S,). offset: complex (S,), nadir pixel. offset_sigma: float64 (S,).
-        lag: float64 (V,) seconds. pair_ok: bool (E,). gps_ok: bool (N,).
-        gps_residual: complex (N,), recorded position minus the network's, lag removed.
+    position: complex (N,). metres: float64 (S,). offset: complex (S,), nadir pixel. offset_sigma: float64 (S,). lag:
+    float64 (V,) seconds. pair_ok: bool (E,). gps_ok: bool (N,). gps_residual: complex (N,), recorded position minus the
+    network's, lag removed.
     """
 
     position: Complex

@@ -53,25 +53,22 @@ class WorkArea:
 
 @dataclass(slots=True, kw_only=True)
 class VehicleState:
-    """One vehicle between passes. It can be pickled; decoded pictures are not part of it.
+    """One vehicle between passes; it can be pickled, without its decoded pictures.
 
     Attributes:
-        vehicle: id. flight: frames, records, adjustment. coarse: cameras before the map was used, coarse_surface: the
-            ground below them in the same frame.
-        surface: its ground. ties, matches: of the last round (empty without a map).
-        roofs: raised points on the map and their heights.
-        unfound: True where there is a map and learned matching is still to be tried.
-        map_shift: float64 (N, 2) or (2,), what the coarse registration added to the coarse cameras.
+        coarse: cameras before the map was used; coarse_surface: the ground below them, in the same frame.
+        surface: its ground. ties, matches: of the last round (empty without a map). roofs: raised points on the map and
+            their heights. map_shift: float64 (N, 2) or (2,), what the coarse registration added to the coarse cameras.
         dense: extra ground points (K, 3) and sigmas (K,). high: points (H, 3) on what stands high above the ground.
-        on_map: True if it was found on the map; had_map: if there was one; carried: if it was not, but neighbours that
-            were carry it. joined: if no map holds it, but it was registered to neighbours that none holds either.
+        had_map: whether there is a map. on_map: whether it was found there; unfound: learned matching is still to be
+            tried. carried: neighbours that were found carry it. joined: no map holds it, but neighbours alike do.
         coarse_shift: how its block was shifted onto a map of far coarser pixels, None if it was not.
-        datum_sigma_m: float64 (N,) of the place of a block that no map holds, by all its receivers; None for one alone.
+        sigma_m: float64 (N,) own error estimates, coarse_sigma_m before the map. receiver_sigma_m: float64 (2,) of its
+            place by its receiver alone, east and north. datum_sigma_m: float64 (N,) of the place of a block that no map
+            holds, by all its receivers; None for one alone.
         false_matches: expected number of agreements with a map of other ground as good as the one that put it there.
         map_distortion_m2: variance of an axis of the map's own local distortion as its ties show it, as far as it is
             more than the error that all ties have in common; NaN without ties.
-        sigma_m: float64 (N,) own error estimates, coarse_sigma_m before the map. receiver_sigma_m: float64 (2,) of its
-            place by its receiver alone, east and north.
         pose_covariance: float32 (N, 6, 6) of the adjusted cameras, see bundle.covariance.StatedErrors.
         fov_sigma_deg: of the field of view. timings: stage -> CPU seconds.
     """

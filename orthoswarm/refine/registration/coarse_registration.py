@@ -39,10 +39,9 @@ _LEARNED_REACH_M: Final = 30.0  # how far they are searched (for its time)
 class CoarseFit:
     """How a vehicle lies on the map after correlation.
 
-    Attributes:
-        correction: float64 (N, 2), metres to add to each camera. matches: all windows found. inlier: bool for each.
-        confidence: share of the windows that agree. If only the sum of their correlations has a peak: 1 minus the ratio
-            of its second peak to the first.
+    correction: float64 (N, 2), metres to add to each camera. matches: all windows found. inlier: bool for each.
+    confidence: share of the windows that agree. If only the sum of their correlations has a peak: 1 minus the ratio of
+    its second peak to the first.
     """
 
     correction: Array

@@ -29,11 +29,9 @@ def false_matches_log10(
     What is tried: one shift for all of them, and for each leg a line of shifts along it (drift of the receiver, error
     of heading), within each of the tolerances of the configuration.
 
-    Args:
-        ground: float64 (Q, 2), where the ties are, metres.
-        shift: float64 (Q, 2), from there to where the map shows them, metres, before anything was fitted to them.
-        order: float64 (Q,), number of the picture. leg: int32 (Q,), its leg, -1 between legs.
-        reach_m: how far each was searched, to each side. patch_m: side of what was compared.
+    ground: float64 (Q, 2), where the ties are, metres. shift: float64 (Q, 2), from there to where the map shows them,
+    before anything was fitted to them. order: float64 (Q,), number of the picture. leg: int32 (Q,), its leg, -1 between
+    legs. reach_m: how far each was searched, to each side. patch_m: side of what was compared.
     """
     # the first tie of each cell of a patch's size
     cells = np.floor(ground / patch_m).astype(np.int64)

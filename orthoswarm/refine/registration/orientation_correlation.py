@@ -175,10 +175,9 @@ def strip_mosaic(
 class Strip:
     """A mosaic of consecutive pictures and the part of the map where it may lie.
 
-    Attributes:
-        gray, valid: the mosaic, float32 and bool (rows, columns).
-        ground, known: the map, `reach` pixels wider on every side. reach: in pixels. gsd_m: of both.
-        offset: (2,) east, north: where the map's pixels lie from those of the mosaic, less than a pixel, metres.
+    gray, valid: the mosaic, float32 and bool (rows, columns). ground, known: the map, `reach` pixels wider on every
+    side. gsd_m: pixel of both. offset: (2,) east, north: where the map's pixels lie from those of the mosaic, less than
+    a pixel, metres.
     """
 
     gray: Floats
