@@ -219,14 +219,6 @@ def as_ties(matches: MapMatches, points: Array) -> MapTies:
     return MapTies(matches.point, points[matches.point, :2] + matches.shift, sigma)
 
 
-def with_sigma_of_residuals(ties: MapTies, residual: Array) -> MapTies:
-    """The same tie points with the sigma that their residuals show: decimetres on new maps, a metre on old ones."""
-    if len(residual) < _TIE_FEWEST_FOR_SIGMA:
-        return ties
-    sigma = float(np.clip(mad_sigma(residual), *_TIE_SIGMA_LIMITS_M))
-    return replace(ties, sigma_m=np.full(len(ties.point), sigma))
-
-
 def roof_matches(flight: FlightBlock, surface: GroundModel, ground: LoadedMap) -> tuple[MapMatches, Array]:
     """Matches of raised points (roofs) with the map, and their heights over the ground (Q,), metres."""
     adj = flight.adjustment
@@ -311,8 +303,10 @@ def _second_round(
     ties = as_ties(matches, flight.adjustment.points)
     for k in range(rounds):
         _step(flight, surface, ties, TIE_SCALES[min(k, 1)])
-        if k in (0, 1):
-            ties = with_sigma_of_residuals(ties, flight.adjustment.tie_residual)
+        residual = flight.adjustment.tie_residual
+        if k in (0, 1) and len(residual) >= _TIE_FEWEST_FOR_SIGMA:  # decimetres on new maps, a metre on old ones
+            sigma = float(np.clip(mad_sigma(residual), *_TIE_SIGMA_LIMITS_M))
+            ties = replace(ties, sigma_m=np.full(len(ties.point), sigma))
         if k == rounds - 2:
             surface = refit_ground(flight, surface, as_smooth=True)
     return surface, ties, matches
