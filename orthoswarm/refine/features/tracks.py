@@ -200,7 +200,7 @@ class Tracker:
             self._gray, self._half, gray, half, self._live.uv, predicted, np.linalg.inv(predicted), limits, guess,
             found, good,
         )  # fmt: skip
-        kept, expected = _gate(guess, found, good, gray.shape[0], gray.shape[1], _FLOW_CHANCE_SHARE)
+        kept, expected = _gate(guess, found, good, gray.shape[0], gray.shape[1])
         return _Flow(good, found, kept, expected)
 
     def _start(self, gray: Gray) -> None:
@@ -228,7 +228,7 @@ class Tracker:
             )
 
 
-def _gate(guess: Floats, found: Floats, ok: Flags, rows: int, cols: int, chance: float) -> tuple[int, int]:
+def _gate(guess: Floats, found: Floats, ok: Flags, rows: int, cols: int) -> tuple[int, int]:
     """Keep flow close to the median residual, which must itself be close to the prediction, in ok, in place.
 
     None is kept where no more agree than corners on different ground would by chance (binomial, 3 sigma). Returns how
@@ -244,6 +244,7 @@ def _gate(guess: Floats, found: Floats, ok: Flags, rows: int, cols: int, chance:
         if np.hypot(*middle) <= _FLOW_MEDIAN_LIMIT_PX:
             ok &= np.hypot(*(residual - middle).T) < _FLOW_GATE_PX
             kept = int(ok.sum())
+    chance = _FLOW_CHANCE_SHARE
     if kept <= chance * expected + 3.0 * np.sqrt(chance * (1.0 - chance) * expected):
         ok[:], kept = False, 0
     return kept, expected
