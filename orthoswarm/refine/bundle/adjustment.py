@@ -126,13 +126,9 @@ class Adjustment:
         )
 
     def step(
-        self,
-        c: float,
-        heights: HeightPrior,
-        ties: MapTies | None = None,
-        tie_c: float = TIE_ROBUST_C,
+        self, c: float, heights: HeightPrior, ties: MapTies | None = None, tie_c: float = TIE_ROBUST_C,
         damping: float = _DAMPING_SHARE,
-    ) -> float:
+    ) -> float:  # fmt: skip
         """One Gauss-Newton step, iteratively reweighted; returns the largest change of a camera position, metres.
 
         Args:
@@ -147,23 +143,16 @@ class Adjustment:
         step_camera, step_common, self.information = system.solve()
         self._move(step_camera, step_common)
         normal_equations.back_substitute(
-            self.points,
-            (self.start, self.tracks.camera, self.slot),
+            self.points, (self.start, self.tracks.camera, self.slot),
             (system.w_obs, system.w_lens, self.point_inverse, system.b_point),
-            step_camera,
-            step_common[: self.layout.lens_columns],
-            POINT_STEP_LIMIT_M,
-        )
+            step_camera, step_common[: self.layout.lens_columns], POINT_STEP_LIMIT_M,
+        )  # fmt: skip
         return float(np.abs(step_camera.reshape(-1, 6)[:, :3]).max()) if len(step_camera) else 0.0
 
     def covariance(
-        self,
-        chosen: NDArray[np.integer],
-        c: float,
-        heights: HeightPrior,
-        ties: MapTies | None = None,
+        self, chosen: NDArray[np.integer], c: float, heights: HeightPrior, ties: MapTies | None = None,
         tie_c: float = TIE_ROBUST_C,
-    ) -> tuple[Array, Array, Array]:
+    ) -> tuple[Array, Array, Array]:  # fmt: skip
         """Covariances of free cameras (K,) at the present state, with the points eliminated, not held; see `step`.
 
         Returns:
@@ -220,6 +209,11 @@ class Adjustment:
         system.side[:, :k], system.corner[:k, :k], system.rhs_common[:k] = lens_side, lens_corner, rhs_lens
         add_priors(system, self.cameras, self.priors, self.layout, common=self.common, free=self.free, slot=self.slot)
         return system
+
+    @property
+    def ground_m(self) -> float:
+        """Median height of the points, metres; 0 without any."""
+        return float(np.median(self.points[:, 2])) if len(self.points) else 0.0
 
     def residuals(self) -> Array:
         """Present reprojection residuals (M, 2), pixels."""

@@ -63,9 +63,8 @@ def solve_factored(factor: Array, right: Array) -> Array:
     if above <= _NARROW_ROWS:
         return np.asarray(lapack.dpbtrs(factor, right, lower=1)[0])
     x = np.array(right, float)
-    blocks = [
-        (a, min(a + _BLOCK_COLUMNS, n), min(a + _BLOCK_COLUMNS - 1 + above, n)) for a in range(0, n, _BLOCK_COLUMNS)
-    ]
+    starts = range(0, n, _BLOCK_COLUMNS)
+    blocks = [(a, min(a + _BLOCK_COLUMNS, n), min(a + _BLOCK_COLUMNS - 1 + above, n)) for a in starts]
     for a, b, end in blocks:
         own, below = _blocks_of(factor, a, b, end)
         x[a:b] = solve_triangular(own, x[a:b], lower=True, check_finite=False)
@@ -107,10 +106,11 @@ def camera_order(tracks: Tracks, position: Array, points: int, free: Flags) -> t
     cam, pt = local[tracks.camera[use]], tracks.point[use]
     observes = csr_matrix((np.ones(len(cam), np.float32), (cam, pt)), shape=(len(index), points))
     graph = (observes @ observes.T).tocoo()
+    extent = np.nan_to_num(position[index, :2] - position[index, :2].mean(0))
     orders = (
         np.arange(len(index)),
         reverse_cuthill_mckee(graph.tocsr(), symmetric_mode=True),
-        np.argsort(_along_longer_side(position[index, :2]), kind="stable"),
+        np.argsort(extent @ np.linalg.eigh(extent.T @ extent)[1][:, -1], kind="stable"),  # along the longer side
     )
     best: tuple[int, Indices] = (len(index), np.arange(len(index)))
     for permutation in orders:
@@ -122,9 +122,3 @@ def camera_order(tracks: Tracks, position: Array, points: int, free: Flags) -> t
     slot = np.full(count, -1, np.int32)
     slot[index] = best[1]
     return slot, min(best[0], max(len(index) - 1, 0))
-
-
-def _along_longer_side(xy: Array) -> Array:
-    """Coordinate (N,) of points (N, 2) along the direction in which they extend most."""
-    centred = np.nan_to_num(xy - xy.mean(0))
-    return np.asarray(centred @ np.linalg.eigh(centred.T @ centred)[1][:, -1])

@@ -63,11 +63,9 @@ _CORRELATION_RADII: Final = 1.5  # ... so many radii (root mean square) of the v
 class StatedErrors:
     """Errors of N pictures as the adjustment states them.
 
-    Attributes:
-        sigma_m: float64 (N,), of the ground point at each picture's centre, `stated_sigma_factor` times the sigma of an
-            axis, metres. fov_sigma_deg: one sigma of the field of view.
-        pose: float32 (N, 6, 6), covariance of position (metres) and rotation about the camera's axes (radians), without
-            the error that is common to all pictures.
+    sigma_m: float64 (N,), of the ground point at each picture's centre, `stated_sigma_factor` times the sigma of an
+    axis, metres. fov_sigma_deg: one sigma of the field of view. pose: float32 (N, 6, 6), covariance of position
+    (metres) and rotation about the camera's axes (radians), without the error that is common to all pictures.
     """
 
     sigma_m: Array
@@ -176,8 +174,7 @@ def common_map_sigma(residual: Array, sigma_m: Array, gsd_m: float) -> float:
 def systematic_tie_offset(leg: Ints, camera: NDArray[np.integer], residual: Array) -> Array:
     """Offset of the map around each picture (N,), metres, where its ties agree on one that the adjustment left; else 0.
 
-    A few deviating ties are wrong matches, or changed ground; if most of the ties around a picture are off by the same
-    vector, the picture or the map is.
+    A few deviating ties are wrong matches or changed ground; if most are off by the same vector, picture or map is.
 
     leg: int32 (N,), -1 in turns. camera: (Q,), picture of each tie. residual: float64 (Q, 2), metres.
     """

@@ -88,28 +88,22 @@ def read_records(frames: Sequence[Frame], grid: LocalGrid, origin: Array) -> Fli
     has_height, has_yaw, has_tilt = np.isfinite(height), np.isfinite(yaw), np.isfinite(pitch)
     filled = float(np.median(height[has_height])) if has_height.any() else DEFAULT_HEIGHT_M
     position = np.column_stack([xy, np.where(has_height, height, filled)])
-    time, timed = _times(frames)
+    time = column([f.time_s for f in frames])
+    rises = len(frames) > 1 and np.isfinite(time).all() and (np.diff(time) >= 0).all() and time[-1] > time[0]
     return FlightRecords(
         position=position,
         yaw=wrap_rad(np.where(has_yaw, yaw, course(xy))),
         pitch=np.where(has_tilt, pitch, -np.pi / 2),
         roll=np.where(np.isfinite(roll), roll, 0.0),
-        time_s=time,
+        time_s=time - time[0] if rises else np.arange(len(frames), dtype=float),
         has_height=has_height,
         has_yaw=has_yaw,
         has_tilt=has_tilt,
         position_sigma=column([f.fix.position_sigma_m for f in frames]),
-        timed=timed,
+        timed=bool(rises),
     )
 
 
 def column(values: Sequence[float | None]) -> Array:
     """Values as an array, NaN for None."""
     return np.array([np.nan if v is None else v for v in values], float)
-
-
-def _times(frames: Sequence[Frame]) -> tuple[Array, bool]:
-    time = column([f.time_s for f in frames])
-    if len(frames) > 1 and np.isfinite(time).all() and (np.diff(time) >= 0).all() and time[-1] > time[0]:
-        return time - time[0], True
-    return np.arange(len(frames), dtype=float), False

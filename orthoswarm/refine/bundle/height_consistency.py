@@ -71,10 +71,9 @@ def release_heights(adjustment: Adjustment) -> Flags:
     wrong = contradicted_heights(adjustment)
     if wrong.any():
         p = adjustment.priors
-        models = [
-            replace(m, height_sigma=UNKNOWN_HEIGHT_SIGMA_M) if w else m for m, w in zip(p.models, wrong, strict=True)
-        ]
-        adjustment.priors = replace(p, models=tuple(models))
+        known = zip(p.models, wrong, strict=True)
+        models = tuple(replace(m, height_sigma=UNKNOWN_HEIGHT_SIGMA_M) if w else m for m, w in known)
+        adjustment.priors = replace(p, models=models)
     return wrong
 
 
@@ -82,10 +81,9 @@ def release_heights(adjustment: Adjustment) -> Flags:
 class FreeHeight:
     """What the adjustment of one vehicle came to without its recorded heights.
 
-    Attributes:
-        focal_px: focal length after each of the last steps.
-        recorded_m: median recorded height above the takeoff point. solved_m: median height above the solved ground.
-        predicted: difference of the two that `predicted_height_offset` expected, and its tolerance, metres.
+    focal_px: focal length after each of the last steps. recorded_m: median recorded height above the takeoff point.
+    solved_m: median height above the solved ground. predicted: difference of the two that `predicted_height_offset`
+    expected, and its tolerance, metres.
     """
 
     focal_px: Sequence[float]
@@ -131,5 +129,4 @@ def log_focal_sigmas(adjustment: Adjustment) -> Array:
 
 
 def _height(adjustment: Adjustment) -> float:
-    ground = float(np.median(adjustment.points[:, 2])) if len(adjustment.points) else 0.0
-    return max(float(np.median(adjustment.cameras.position[:, 2])) - ground, 1.0)
+    return max(float(np.median(adjustment.cameras.position[:, 2])) - adjustment.ground_m, 1.0)

@@ -29,11 +29,9 @@ _ATTITUDE_ROBUST_C: Final = 25.0  # robust scale of recorded attitudes, squared 
 class GroupPriors:
     """Sigmas of the errors common to all frames of a group (a vehicle's sortie); SI units and radians.
 
-    Attributes:
-        bias_sigma: attitude bias about the camera's x, y, z axes. height_sigma: common offset of recorded heights.
-        lag_sigma: delay of the recorded position (0 switches it off).
-        drift_sigma: size of the receiver's drift (0 switches it off); drift_bend: second difference of its knots;
-            knot_every: frames between knots.
+    bias_sigma: attitude bias about the camera's x, y, z axes. height_sigma: common offset of recorded heights.
+    lag_sigma: delay of the recorded position; drift_sigma: size of the receiver's drift (0 switches them off).
+    drift_bend: second difference of the drift's knots; knot_every: frames between knots.
     """
 
     bias_sigma: tuple[float, float, float] = tuple(np.radians(ATTITUDE_BIAS_SIGMA_DEG))
@@ -103,13 +101,9 @@ class Layout:
             knots.append(k)
             at += 5 + 2 * k
         return cls(
-            lens_columns=columns,
-            offset=tuple(offset),
-            knots=tuple(knots),
-            size=at,
-            knot_left=left,
+            lens_columns=columns, offset=tuple(offset), knots=tuple(knots), size=at, knot_left=left,
             knot_fraction=fraction,
-        )
+        )  # fmt: skip
 
     def drift(self, common: Array, group: Ints) -> Array:
         """Drift (N, 2) of each camera for the common unknowns (size,)."""
@@ -124,15 +118,9 @@ class Layout:
 
 
 def add_priors(
-    system: BandedSystem,
-    cameras: CameraBlock,
-    priors: Priors,
-    layout: Layout,
-    *,
-    common: Array,
-    free: Flags,
+    system: BandedSystem, cameras: CameraBlock, priors: Priors, layout: Layout, *, common: Array, free: Flags,
     slot: Ints,
-) -> None:
+) -> None:  # fmt: skip
     """Add all priors to the normal equations of the free cameras in place; common: (layout.size,), free, slot: (N,)."""
     weight = np.where(priors.lens_sigma > 0, 1.0 / np.maximum(priors.lens_sigma, 1e-12) ** 2, _HELD).ravel()
     diagonal = np.arange(layout.lens_columns)
@@ -174,15 +162,9 @@ def bias_axes(rotation: Array) -> Array:
 
 
 def _add_attitudes(
-    system: BandedSystem,
-    cameras: CameraBlock,
-    priors: Priors,
-    *,
-    layout: Layout,
-    common: Array,
-    index: NDArray[np.intp],
-    at: Ints,
-) -> None:
+    system: BandedSystem, cameras: CameraBlock, priors: Priors, *, layout: Layout, common: Array,
+    index: NDArray[np.intp], at: Ints,
+) -> None:  # fmt: skip
     """Attitude priors: rotation from recorded to solved attitude, minus the bias; at: first row of each camera."""
     base = np.asarray(layout.offset)[priors.group[index]]
     recorded = priors.rotation[index]
@@ -206,20 +188,16 @@ def _add_positions(
 ) -> None:
     """Position priors: recorded positions with lag and drift, heights with their offset."""
     base = np.asarray(layout.offset)[priors.group[index]]
-    knots = np.asarray(layout.knots)[priors.group[index]]
+    has = np.asarray(layout.knots)[priors.group[index]] > 0
     xy, rz = residual[:, :2], residual[:, 2]
     w = _weights(priors.position_sigma[index])
     w[:, :2] *= robust_weights((xy * xy * w[:, :2]).sum(1), POSITION_ROBUST_C)[:, None]
-    left = layout.knot_left[index]
-    fraction = layout.knot_fraction[index]
+    left, fraction = layout.knot_left[index], layout.knot_fraction[index]
     for a in range(2):
         wa, ra = w[:, a], xy[:, a]
-        columns = [base + 4]
-        factors = [-priors.velocity[index, a]]
-        has = knots > 0
-        columns += [base + 5 + 2 * left + a, base + 5 + 2 * (left + 1) + a]
-        factors += [np.where(has, fraction - 1.0, 0.0), np.where(has, -fraction, 0.0)]
-        columns = [np.where(has, c, base + 4) if n else c for n, c in enumerate(columns)]
+        knot = np.where(has, base + 5 + 2 * left + a, base + 4)  # without a drift any column, with factors of 0
+        columns = [base + 4, knot, np.where(has, knot + 2, base + 4)]
+        factors = [-priors.velocity[index, a], np.where(has, fraction - 1.0, 0.0), np.where(has, -fraction, 0.0)]
         system.band[0, at + a] += wa
         system.rhs[at + a] -= wa * ra
         for c, f in zip(columns, factors):

@@ -90,10 +90,10 @@ def calibrate(
                 ratios.append(ratio)
                 owners.append(k)
     if len(ratios) < 2:
-        none = np.zeros(len(leg))
         return Calibration(
-            focal_px=f0, height_m=h0, yaw_offset=none, trusted_height=usable, pairs=len(ratios), warnings=[]
-        )
+            focal_px=f0, height_m=h0, yaw_offset=np.zeros(len(leg)), trusted_height=usable, pairs=len(ratios),
+            warnings=[],
+        )  # fmt: skip
     r = np.array(ratios)
     offset, warnings = _heading(records, leg, r, np.array(owners))
     factor = np.abs(r)

@@ -11,13 +11,14 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.model.arrays import Array, Complex, Flags, Floats, Indices, Ints
 from orthoswarm.refine.bundle.block_arrays import Tracks
-from orthoswarm.refine.features.sift_features import SIFT_CELLS, SiftFeatures, root_sift
+from orthoswarm.refine.features.sift_features import SIFT_CELLS, SiftFeatures
 from orthoswarm.trajectory.legs import PAUSE_S
 
 _MATCH_RATIO: Final = 0.85
@@ -54,7 +55,7 @@ def match_features(one: SiftFeatures, two: SiftFeatures) -> Ints:
     MAGSAC (Barath et al. 2020). Fewer than `_MATCH_LEAST` inliers count as no match.
     """
     none = np.zeros((0, 2), np.int32)
-    candidates = mutual_nearest(_unit(one), _unit(two))
+    candidates = mutual_nearest(_root_sift(one), _root_sift(two))
     if len(candidates) < _MATCH_LEAST:
         return none
     p = one.uv[candidates[:, 0]] / np.float32(one.step_px)
@@ -84,28 +85,16 @@ def mutual_nearest(one: Floats, two: Floats) -> Ints:
 
 
 def _similarity_inliers(p: Floats, q: Floats, threshold: float) -> Flags:
-    import cv2
-
     matrix, inliers = cv2.estimateAffinePartial2D(
-        p,
-        q,
-        method=cv2.RANSAC,
-        ransacReprojThreshold=threshold,
-        maxIters=_RANSAC_ROUNDS,
-        confidence=_RANSAC_CONFIDENCE,
-        refineIters=2,
-    )
-    if matrix is None:
-        return np.zeros(len(p), bool)
-    scale = float(np.hypot(matrix[0, 0], matrix[1, 0]))
-    if not _PLANE_SCALES[0] <= scale <= _PLANE_SCALES[1]:
+        p, q, method=cv2.RANSAC, ransacReprojThreshold=threshold, maxIters=_RANSAC_ROUNDS,
+        confidence=_RANSAC_CONFIDENCE, refineIters=2,
+    )  # fmt: skip
+    if matrix is None or not _PLANE_SCALES[0] <= float(np.hypot(matrix[0, 0], matrix[1, 0])) <= _PLANE_SCALES[1]:
         return np.zeros(len(p), bool)
     return np.asarray(inliers[:, 0] > 0)
 
 
 def _epipolar_inliers(p: Floats, q: Floats) -> Flags:
-    import cv2
-
     try:
         _, inliers = cv2.findFundamentalMat(p, q, cv2.USAC_MAGSAC, _EPIPOLAR_PX, _RANSAC_CONFIDENCE, _RANSAC_ROUNDS)
     except cv2.error:  # OpenCV 5.0 asserts where it finds no model
@@ -114,8 +103,11 @@ def _epipolar_inliers(p: Floats, q: Floats) -> Flags:
 
 
 @lru_cache(maxsize=64)
-def _unit(features: SiftFeatures) -> Floats:
-    return root_sift(features.descriptor)
+def _root_sift(features: SiftFeatures) -> Floats:
+    """Unit vectors float32 (n, 128) whose dot product compares SIFT descriptors by the Hellinger kernel."""
+    d = features.descriptor.astype(np.float32)
+    d /= np.maximum(d.sum(axis=1, keepdims=True), 1.0)
+    return np.asarray(np.sqrt(d, out=d))
 
 
 def consecutive(group: NDArray[np.integer], time_s: Array) -> Ints:
@@ -178,22 +170,17 @@ def build_tracks(features: Sequence[SiftFeatures], pairs: Sequence[Pair]) -> Tra
     offset = np.concatenate([[0], np.cumsum([len(f) for f in features])]).astype(np.int64)
     photo = np.repeat(np.arange(len(features), dtype=np.int32), np.diff(offset))
     same = [f.same_point() for f in features]
-    joins: list[Indices] = []
+    joins = [np.zeros((0, 2), np.int64)]
     for pair in sorted(pairs, key=lambda p: (-len(p), p.first, p.second)):
         a = offset[pair.first] + same[pair.first][pair.match[:, 0]]
         b = offset[pair.second] + same[pair.second][pair.match[:, 1]]
         joins.append(np.stack([a, b], axis=1))
-    edges = np.concatenate(joins) if joins else np.zeros((0, 2), np.int64)
-    root = _union(edges, photo, len(photo), _TRACK_LONGEST)
-    return _tracks(root, photo, features)
-
-
-def _tracks(root: Indices, photo: Ints, features: Sequence[SiftFeatures]) -> Tracks:
+    root = _union(np.concatenate(joins), photo, len(photo), _TRACK_LONGEST)
     _, inverse, count = np.unique(root, return_inverse=True, return_counts=True)
     node = np.flatnonzero(count[inverse] >= 2)
-    uv = np.concatenate([f.uv for f in features]) if len(features) else np.zeros((0, 2), np.float32)
-    sigma = np.concatenate([f.sigma_px for f in features]) if len(features) else np.zeros(0, np.float32)
-    return Tracks(photo[node], inverse[node].astype(np.int32), uv[node].astype(np.float64), sigma[node]).renumbered()
+    uv = np.concatenate([np.zeros((0, 2), np.float32), *(f.uv for f in features)])[node]
+    sigma = np.concatenate([np.zeros(0, np.float32), *(f.sigma_px for f in features)])[node]
+    return Tracks(photo[node], inverse[node].astype(np.int32), uv.astype(np.float64), sigma).renumbered()
 
 
 @in_place_kernel

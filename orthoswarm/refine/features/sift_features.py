@@ -7,6 +7,7 @@ on a few glints and roofs; a cap per cell of the picture keeps the geometry well
 from dataclasses import dataclass
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,7 +35,7 @@ class SiftFeatures:
 
     Attributes:
         uv: float32 (n, 2), column and row in the FULL picture (width, height), pixel centres at integers.
-        descriptor: uint8 (n, 128), SIFT descriptors as OpenCV gives them (see `root_sift`).
+        descriptor: uint8 (n, 128), SIFT descriptors as OpenCV gives them.
         sigma_px: float32 (n,), one sigma of the position in pixels of the full picture.
         step_px: full-picture pixels per pixel of the reduced picture.
     """
@@ -52,21 +53,13 @@ class SiftFeatures:
     @classmethod
     def none(cls, width: int, height: int) -> "SiftFeatures":
         """An empty set for a picture of this size."""
-        empty = np.zeros((0, 2), np.float32)
-        none = np.zeros((0, 128), np.uint8)
+        empty, none = np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8)
         return cls(uv=empty, descriptor=none, sigma_px=empty[:, 0], width=width, height=height, step_px=1.0)
 
     def same_point(self) -> Ints:
         """The first feature at the place of each, int32 (n,): SIFT returns a point once for each strong orientation."""
         _, first, inverse = np.unique(self.uv, axis=0, return_index=True, return_inverse=True)
         return np.asarray(first[inverse.reshape(-1)], dtype=np.int32)
-
-
-def root_sift(descriptor: Gray) -> Floats:
-    """Unit vectors float32 (n, 128) whose dot product compares SIFT descriptors by the Hellinger kernel."""
-    d = descriptor.astype(np.float32)
-    d /= np.maximum(d.sum(axis=1, keepdims=True), 1.0)
-    return np.asarray(np.sqrt(d, out=d))
 
 
 def detect(gray: Gray, width: int, height: int, working_pixels: int = SIFT_PIXELS) -> SiftFeatures:
@@ -77,8 +70,6 @@ def detect(gray: Gray, width: int, height: int, working_pixels: int = SIFT_PIXEL
         width, height: of the full picture, in whose pixels positions are given.
         working_pixels: number of pixels of the reduced picture on which features are found.
     """
-    import cv2
-
     reduced, step = reduce_picture(gray, width, height, working_pixels)
     sift = cv2.SIFT_create(  # type: ignore[attr-defined,unused-ignore]
         nfeatures=_SIFT_DETECTED, contrastThreshold=_SIFT_CONTRAST, enable_precise_upscale=True
@@ -87,8 +78,7 @@ def detect(gray: Gray, width: int, height: int, working_pixels: int = SIFT_PIXEL
     if len(keypoints) == 0:
         return SiftFeatures.none(width, height)
     xy = np.array([k.pt for k in keypoints], np.float32)
-    response = np.array([k.response for k in keypoints], np.float32)
-    size = np.array([k.size for k in keypoints], np.float32)
+    response, size = (np.array([getattr(k, name) for k in keypoints], np.float32) for name in ("response", "size"))
     keep = spread(xy, response, reduced.shape[1], reduced.shape[0])
     uv = (xy[keep] + np.float32(0.5)) * np.float32(step) - np.float32(0.5)
     spread_px = np.hypot(np.float32(_SIFT_SIGMA_PX), np.float32(_SIFT_SIGMA_SHARE) * size[keep])
@@ -100,8 +90,6 @@ def detect(gray: Gray, width: int, height: int, working_pixels: int = SIFT_PIXEL
 
 def reduce_picture(gray: Gray, width: int, height: int, working_pixels: int) -> tuple[Gray, float]:
     """The picture reduced to about the working size (never enlarged), and full-size pixels per reduced pixel."""
-    import cv2
-
     ratio = min(1.0, float(np.sqrt(working_pixels / (width * height))))
     columns, rows = max(16, round(width * ratio)), max(16, round(height * ratio))
     if (columns, rows) != (gray.shape[1], gray.shape[0]):

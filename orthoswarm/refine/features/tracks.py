@@ -8,7 +8,6 @@ Sobel gradients and a square window as in OpenCV's cornerMinEigenVal; only wante
 that float32 holds exactly.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -122,8 +121,10 @@ class Tracker:
         else:
             self._go_on(predicted)
             if len(self._live.ident):
-                survived = self._follow(gray, half, predicted)
-        self._hold(gray)
+                survived = self._follow(self._gray, gray, half, predicted)
+        if self._stack is None or self._stack.shape[1:] != gray.shape:
+            self._stack = np.zeros((_ANCHOR_PHOTOS, *gray.shape), np.uint8)
+        self._stack[(self._count - 1) % len(self._stack)] = gray
         self._start(gray)
         self._log.append((index, self._live.ident.copy(), self._live.uv.copy()))
         self._gray, self._half = gray, half
@@ -151,15 +152,15 @@ class Tracker:
         now = np.eye(3) if homography is None else homography @ self._chain[(self._count - 2) % photos]
         self._chain[(self._count - 1) % photos] = now / now[2, 2]
 
-    def _follow(self, gray: Gray, half: Gray, predicted: Array) -> float:
-        before, live = len(self._live.ident), self._live
+    def _follow(self, before: Gray, gray: Gray, half: Gray, predicted: Array) -> float:
+        live = self._live
         flow = self._flow(gray, half, predicted)
         if flow.kept < max(_SHIFT_BELOW_CORNERS, _SHIFT_BELOW_SHARE * flow.expected):
-            shifted = shifted_prediction(self._gray, gray, predicted)
+            shifted = shifted_prediction(before, gray, predicted)
             if shifted is not None:
                 flow, predicted = self._better(gray, half, shifted, flow, predicted)
         if flow.kept < _HOMOGRAPHY_BELOW_SHARE * flow.expected:
-            measured = measured_homography(self._gray, gray, live.uv, predicted)
+            measured = measured_homography(before, gray, live.uv, predicted)
             if measured is not None:
                 flow, predicted = self._better(gray, half, measured, flow, predicted)
                 self._go_on(predicted)
@@ -169,7 +170,7 @@ class Tracker:
         self._live = followed.take(
             _oldest_per_cell(followed.uv, followed.age, followed.ident, gray.shape[1], self.cell_px)
         )
-        return flow.kept / max(before, 1)
+        return flow.kept / len(live.ident)
 
     def _better(self, gray: Gray, half: Gray, other: Array, now: _Flow, predicted: Array) -> tuple[_Flow, Array]:
         """The present flow or, if it keeps more tracks, that from another prediction; with the prediction used."""
@@ -189,11 +190,6 @@ class Tracker:
         )  # fmt: skip
         lost = ~ok | (now + 1 - live.anchor >= photos)
         live.anchor[lost], live.anchor_uv[lost] = now, live.uv[lost]
-
-    def _hold(self, gray: Gray) -> None:
-        if self._stack is None or self._stack.shape[1:] != gray.shape:
-            self._stack = np.zeros((_ANCHOR_PHOTOS, *gray.shape), np.uint8)
-        self._stack[(self._count - 1) % len(self._stack)] = gray
 
     def _flow(self, gray: Gray, half: Gray, predicted: Array) -> _Flow:
         """Flow of the live tracks from the predicted positions, without outliers."""
@@ -248,6 +244,7 @@ def _gate(guess: Floats, found: Floats, ok: Flags, shape: tuple[int, ...]) -> tu
         if np.hypot(*middle) <= _FLOW_MEDIAN_LIMIT_PX:
             ok &= np.hypot(*(residual - middle).T) < _FLOW_GATE_PX
             kept = int(ok.sum())
+    chance = _FLOW_CHANCE_SHARE
     if kept <= chance * expected + 3.0 * np.sqrt(chance * (1.0 - chance) * expected):
         ok[:], kept = False, 0
     return kept, expected
@@ -262,7 +259,7 @@ def _oldest_per_cell(uv: Floats, age: Indices, ident: Indices, cols: int, size: 
     return keep
 
 
-def measured_homography(previous: Gray | None, gray: Gray, uv: Floats, predicted: Array) -> Array | None:
+def measured_homography(previous: Gray, gray: Gray, uv: Floats, predicted: Array) -> Array | None:
     """The homography that most of a flow over several octaves agrees on; None without agreement.
 
     For a swaying camera whose angles are degrees off or not recorded. From the prediction and, without a consensus (a
@@ -270,7 +267,7 @@ def measured_homography(previous: Gray | None, gray: Gray, uv: Floats, predicted
 
     uv: float32 (K, 2), corners of the previous picture. predicted: 3x3 homography from its pixels.
     """
-    if previous is None or len(uv) < _HOMOGRAPHY_LEAST:
+    if len(uv) < _HOMOGRAPHY_LEAST:
         return None
     for start in (predicted, np.eye(3)):
         aligned = shifted_prediction(previous, gray, start)
@@ -315,10 +312,8 @@ def _agreed(a: Floats, b: Floats, fewest: float) -> Array | None:
     return np.asarray(homography, np.float64)
 
 
-def shifted_prediction(previous: Gray | None, gray: Gray, predicted: Array) -> Array | None:
+def shifted_prediction(previous: Gray, gray: Gray, predicted: Array) -> Array | None:
     """The prediction corrected by a shift from phase correlation of reduced pictures, None if that is unclear."""
-    if previous is None:
-        return None
     warped = cv2.warpPerspective(previous, predicted, gray.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
     dx, dy, response = phase_shift(warped, gray, 1.0 / _PHASE_REDUCTION)
     if response <= _PHASE_RESPONSE:
@@ -341,33 +336,6 @@ def predicted_homography(before: Array, after: Array, height_m: float, step: Arr
     upward = before[2]  # the ground's normal in the earlier camera's axes
     relative = after.T @ before + np.outer(after.T @ step, upward) / height_m
     return np.asarray(matrix @ relative @ np.linalg.inv(matrix))
-
-
-def follow(
-    count: int,
-    read: Callable[[int], Gray],
-    prediction: Callable[[int], Array | None],
-    cell_px: int,
-    hopeless: Callable[[Array], bool],
-) -> tuple[Tracks, Array] | None:
-    """The tracks of corners through pictures 0 .. count - 1, and the share that survived into each, float64 (count,).
-
-    Args:
-        read: returns picture i at working scale.
-        prediction: 3x3 homography from picture i - 1 to i, None where tracking starts afresh.
-        cell_px: see Tracker.
-        hopeless: whether to give up, by the shares so far; the rest of them are 1.
-
-    Returns:
-        None if it was given up.
-    """
-    tracker = Tracker(cell_px=cell_px)
-    survived = np.ones(count)
-    for i in range(count):
-        survived[i] = tracker.add(i, read(i), prediction(i))
-        if hopeless(survived):
-            return None
-    return tracker.tracks(), survived
 
 
 @kernel

@@ -85,9 +85,9 @@ class Pictures:
 
     def once(self, i: int) -> Gray:
         """As `gray`, of a picture that is asked for once: nothing of it is kept."""
-        if self._frames[i].damaged:  # parts of it may show another moment: its record is used, its content is not
-            return np.full(self.size[::-1], 127, np.uint8)
         frame, unusable = self._frames[i], np.full(self.size[::-1], 127, np.uint8)
+        if frame.damaged:  # parts of it may show another moment: its record is used, its content is not
+            return unusable
         try:
             picture = self._read(frame)
         except PictureError as error:

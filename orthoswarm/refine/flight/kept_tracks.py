@@ -25,15 +25,12 @@ _MOST_KEPT: Final = 8  # stretches whose tracks are kept for a refinement that f
 class Followed:
     """What was measured in the pictures of a flight (N) from one to the next.
 
-    Attributes:
-        calibration: focal length and headings by the flow. tracks: corners that were tracked, in working pixels.
-        survived: float64 (N,), share of the tracks that survived into each picture.
-        small: index -> reduced picture. damaged: index -> why that picture cannot be used.
+    calibration: focal length and headings by the flow. tracks: corners that were tracked, in working pixels.
+    small: index -> reduced picture. damaged: index -> why that picture cannot be used.
     """
 
     calibration: Calibration
     tracks: Tracks
-    survived: Array
     small: dict[int, Gray]
     damaged: dict[int, str]
 

@@ -1,6 +1,6 @@
-"""Messages for the report: contradictions between pictures and records, and reasons why photos were not placed."""
+"""Messages for the report: contradictions between pictures and records."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -19,7 +19,6 @@ _TILT_DIFFERENCE_DEG: Final = 2.0  # a larger difference of recorded tilts is re
 _TILT_DIFFERENCE_SIGMAS: Final = 3.0  # ... if it exceeds so many of its sigmas
 _ONE_WAY_LENGTH: Final = 0.9  # mean unit vector of headings from which a tilt is like a slope of the ground
 _SLOPE_DEG: Final = 6.0  # then a difference of tilts is reported only above this
-_OBLIQUE_DEG: Final = 35.0  # a photo tilted more that matches no other is reported as oblique
 _HEIGHT_DIFFERENCE_SHARE: Final = 0.15  # a recorded height that differs by more is reported, as a share
 _HEIGHT_DIFFERENCE_SIGMAS: Final = 4.0  # ... and by more than so many sigmas of the focal length
 _LEAST_HEIGHT_M: Final = 2.0  # a recorded height below this cannot be meant and is reported
@@ -28,37 +27,14 @@ _LAG_LEAST_SPEED_M_S: Final = 0.3  # a lag is not estimated from slower photos, 
 NAMED_MOST: Final = 3  # runs of photos, or vehicles, that a message names
 
 
-def flipped_yaw(records: PhotoRecords, start: InitialOrientation) -> Flags:
-    """Photos whose recorded yaw is off by 180 degrees from the picture's, bool (N,)."""
-    flipped = np.zeros(len(records), bool)
-    for v, tag in enumerate(start.tags):
-        if tag.source:
-            rows = (records.vehicle == v) & start.yaw_known
-            off = np.abs(wrap_rad(start.yaw - getattr(records, tag.source) - tag.offset))
-            flipped |= rows & (np.nan_to_num(off) > np.radians(_FLIPPED_YAW_DEG))
-    return flipped
-
-
 def findings(frames: Sequence[Frame], records: PhotoRecords, start: InitialOrientation) -> list[str]:
     """Sentences on records that contradict the pictures, except heights (see `height_findings`)."""
     kinds = (_yaw_findings, _tilt_findings, _position_findings)
-    return [text for kind in kinds for text in kind(frames, records, start)] + _overlap_findings(start)
-
-
-def unplaced_reasons(
-    frames: Sequence[Frame], records: PhotoRecords, placed: Flags, damaged: Mapping[int, str]
-) -> dict[int, str]:
-    """Reasons why photos have no tie points to others."""
-    reasons = dict(damaged)
-    for k in np.flatnonzero(~placed).tolist():
-        tilt = float(np.degrees(records.pitch[k])) + 90.0
-        if k in reasons:
-            continue
-        if tilt > _OBLIQUE_DEG:
-            reasons[k] = f"{frames[k].image} looks {tilt:.0f} degrees off nadir and matches no other photo"
-        else:
-            reasons[k] = f"{frames[k].image} matches no other photo; it is placed by its tags alone"
-    return reasons
+    found = [text for kind in kinds for text in kind(frames, records, start)]
+    parts = int((np.bincount(start.component) > 1).sum())
+    if parts > 1:
+        found.append(f"the photos fall into {parts} parts without overlap; each lies in the frame of its own positions")
+    return found
 
 
 def runs(names: Sequence[str], flags: Flags) -> str:
@@ -77,20 +53,24 @@ def _name(frames: Sequence[Frame], records: PhotoRecords, vehicle: int) -> str:
 
 
 def _yaw_findings(frames: Sequence[Frame], records: PhotoRecords, start: InitialOrientation) -> list[str]:
-    names = [f.image for f in frames]
     found = []
-    flips = flipped_yaw(records, start)
-    if flips.any():
-        found.append(f"the recorded yaw is turned by 180 degrees on {int(flips.sum())} photos ({runs(names, flips)})")
+    flipped = np.zeros(len(records), bool)
     for v, tag in enumerate(start.tags):
         rows = (records.vehicle == v) & start.yaw_known
         who = _name(frames, records, v)
+        if tag.source:
+            off = np.abs(wrap_rad(start.yaw - getattr(records, tag.source) - tag.offset))
+            flipped |= rows & (np.nan_to_num(off) > np.radians(_FLIPPED_YAW_DEG))
         if not tag.source and (rows & np.isfinite(records.yaw)).sum() >= 3:
             found.append(f"{who}: the recorded yaw does not follow the pictures; headings come from the pictures")
         elif tag.source and abs(np.degrees(tag.offset)) > _HEADING_OFFSET_DEG:
             found.append(f"{who}: recorded headings are {-np.degrees(tag.offset):+.0f} degrees off, put right")
         elif tag.source == "flight_yaw" and np.isfinite(records.yaw[rows]).any():
             found.append(f"{who}: the pictures follow the airframe's heading, not the recorded camera yaw")
+    if flipped.any():
+        where = runs([f.image for f in frames], flipped)
+        text = f"the recorded yaw is turned by 180 degrees on {int(flipped.sum())} photos ({where})"
+        found.insert(0, text)
     return found
 
 
@@ -126,8 +106,7 @@ def height_findings(
 ) -> list[str]:
     """Sentences on recorded heights that contradict pictures adjusted without a map, and on those not recorded."""
     found, without = [], []
-    ground = float(np.median(adjustment.points[:, 2])) if len(adjustment.points) else 0.0
-    height = adjustment.cameras.position[:, 2] - ground
+    height = adjustment.cameras.position[:, 2] - adjustment.ground_m
     doubt = log_focal_sigmas(adjustment)[adjustment.cameras.lens_id]
     for v in range(len(start.tags)):
         rows = records.vehicle == v
@@ -168,10 +147,3 @@ def _position_findings(frames: Sequence[Frame], records: PhotoRecords, start: In
         if len(moving) and abs(lag) * float(np.median(moving)) > _LAG_M:
             found.append(f"{_name(frames, records, v)}: recorded positions lag by {lag:.1f} s")
     return found
-
-
-def _overlap_findings(start: InitialOrientation) -> list[str]:
-    parts = int((np.bincount(start.component) > 1).sum())
-    if parts <= 1:
-        return []
-    return [f"the photos fall into {parts} parts without overlap; each lies in the frame of its own positions"]

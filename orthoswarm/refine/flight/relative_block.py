@@ -18,7 +18,7 @@ from orthoswarm.refine.bundle.flight_records import FlightRecords, read_records
 from orthoswarm.refine.bundle.height_consistency import UNKNOWN_HEIGHT_SIGMA_M
 from orthoswarm.refine.bundle.priors import DRIFT_SIGMA_M, HEIGHT_OFFSET_SIGMA_M, LAG_SIGMA_S, GroupPriors, Priors
 from orthoswarm.refine.features.flow_calibration import Calibration, calibrate
-from orthoswarm.refine.features.tracks import CELL_PX, follow, predicted_homography
+from orthoswarm.refine.features.tracks import CELL_PX, Tracker, predicted_homography
 from orthoswarm.refine.features.working_pictures import Pictures, ReadGray
 from orthoswarm.refine.flight.kept_tracks import Followed, KeptTracks
 from orthoswarm.trajectory.legs import leads_one_way, split_legs
@@ -62,9 +62,8 @@ INLIER_WEIGHT: Final = 0.5  # an observation counts as an inlier from this robus
 class BestViews:
     """For each point the inlier observation nearest to its camera's nadir, and the quality of the point's observations.
 
-    Attributes (P points):
-        camera: int32 (P,), of that observation, -1 where there is none. count: int32 (P,), inlier observations.
-        mean_weight: float64 (P,), mean robust weight.
+    camera: int32 (P,), of that observation, -1 where there is none. count: int32 (P,), inlier observations.
+    mean_weight: float64 (P,), mean robust weight.
     """
 
     camera: Ints
@@ -79,7 +78,6 @@ class FlightBlock:
     Attributes:
         frames: in order. records: their records (headings already corrected). leg: int32 (N,).
         pictures: grey pictures. calibration: first guess. adjustment: the cameras and points.
-        survived: float64 (N,), share of tracks that survived into each picture.
         warnings: for the report. sparse: True if photos were matched in pairs instead of tracked.
         focal_sigma: relative sigma of a focal length found together with other vehicles and fixed since (else 0).
     """
@@ -90,7 +88,6 @@ class FlightBlock:
     pictures: Pictures
     calibration: Calibration
     adjustment: Adjustment
-    survived: Array
     warnings: list[str]
     sparse: bool = False
     focal_sigma: float = 0.0
@@ -111,30 +108,41 @@ class FlightBlock:
 
     def best_views(self, some: Flags | None = None) -> BestViews:
         """Best view of each tie point, chosen among the vehicle's own pictures, or among some (N,) of them."""
-        adj = self.adjustment
+        adj, n = self.adjustment, len(self.adjustment.points)
+        camera, point, weight = adj.tracks.camera, adj.tracks.point, adj.obs_weight
         own = np.zeros(len(adj.cameras), bool)
         own[: len(self.frames)] = True if some is None else some
-        return best_views(adj.cameras, adj.tracks, adj.points, adj.obs_weight, own)
+        inlier = weight > INLIER_WEIGHT
+        usable = inlier & own[camera]
+        distance = np.hypot(*(adj.cameras.position[camera, :2] - adj.points[point, :2]).T)
+        order = np.lexsort((np.where(usable, distance, np.inf), point))
+        best = order[np.minimum(np.searchsorted(point[order], np.arange(n)), len(order) - 1)]
+        total = np.bincount(point, minlength=n)
+        shown = np.where((total > 0) & usable[best], camera[best], -1).astype(np.int32)
+        count = np.bincount(point[inlier], minlength=n).astype(np.int32)
+        return BestViews(shown, count, np.bincount(point, weight, minlength=n) / np.maximum(total, 1))
+
+    def one_per_cell(self, seen: BestViews, usable: Flags, cost: Array | Ints, cell_m: float) -> Indices:
+        """The usable point of least cost in each ground cell of each leg, of those seen: indices, sorted."""
+        use = np.flatnonzero(usable & (seen.camera >= 0))
+        cell = np.floor(self.adjustment.points[use, :2] / cell_m).astype(np.int64)
+        order = np.lexsort((use, cost[use]))
+        key = np.column_stack([cell, self.leg[seen.camera[use]]])
+        _, first = np.unique(key[order], axis=0, return_index=True)
+        return np.sort(use[order[first]])
 
 
 def open_flight(
-    frames: Sequence[Frame],
-    grid: LocalGrid,
-    origin: Array,
-    read: ReadGray,
-    fov_start: float,
-    *,
+    frames: Sequence[Frame], grid: LocalGrid, origin: Array, read: ReadGray, fov_start: float, *,
     kept: KeptTracks | None = None,
-) -> FlightBlock | None:
+) -> FlightBlock | None:  # fmt: skip
     """Track corners through a vehicle's pictures, in order, and set up its adjustment, without solving it.
 
-    Args:
-        fov_start: assumed horizontal field of view, radians. kept: where the tracks are kept, and found again.
+    fov_start: assumed horizontal field of view, radians. kept: where the tracks are kept, and found again.
 
-    Returns:
-        None where pictures are matched in pairs instead (see `open_sparse_flight`): too little overlap, a height that
-        contradicts the scale, or, where no height was recorded, a chain that breaks, or a single straight line, on
-        which drift and scale cannot be separated.
+    Returns None where pictures are matched in pairs instead (see `open_sparse_flights`): too little overlap, a height
+    that contradicts the scale, or, where no height was recorded, a chain that breaks, or a single straight line, on
+    which drift and scale cannot be separated.
     """
     if len(frames) < _FOLLOWED_PHOTOS:
         return None
@@ -160,7 +168,6 @@ def open_flight(
         pictures=pictures,
         calibration=calibration,
         adjustment=_begin(records, pictures, calibration, followed.tracks),
-        survived=followed.survived,
         warnings=list(calibration.warnings),
     )
 
@@ -181,17 +188,10 @@ def _follow(records: FlightRecords, leg: Ints, pictures: Pictures, fov_start: fl
         return bool(broken or np.median(survived[1:]) < _FOLLOWED_SURVIVAL)
 
     turned = replace(records, yaw=records.yaw + calibration.yaw_offset)
-    found = _track(turned, pictures, calibration, hopeless)
-    if found is None or found[0].count < _FOLLOWED_TRACKS_FACTOR * len(records.position) ** 0.5:
+    tracks = _track(turned, pictures, calibration, hopeless)
+    if tracks is None or tracks.count < _FOLLOWED_TRACKS_FACTOR * len(records.position) ** 0.5:
         return None
-    tracks, survived = found
-    return Followed(
-        calibration=calibration,
-        tracks=tracks,
-        survived=survived,
-        small=pictures.reduced(),
-        damaged=dict(pictures.damaged),
-    )
+    return Followed(calibration=calibration, tracks=tracks, small=pictures.reduced(), damaged=dict(pictures.damaged))
 
 
 def weigh_records(flight: FlightBlock) -> None:
@@ -238,22 +238,24 @@ def _step_sigma(values: Array) -> Array:
 
 def _track(
     records: FlightRecords, pictures: Pictures, calibration: Calibration, hopeless: Callable[[Array], bool]
-) -> tuple[Tracks, Array] | None:
+) -> Tracks | None:
+    """Tracks; None once the shares of them that survived into each picture, 1 to begin with, are hopeless."""
     rotation, steps = records.rotation(), records.steps()
     width, height = pictures.size
-    f = calibration.focal_px
+    f, height_m = calibration.focal_px, calibration.height_m
     matrix = np.array([[f, 0, 0.5 * (width - 1)], [0, f, 0.5 * (height - 1)], [0, 0, 1.0]])
-    reach = _PREDICTED_STEP_SHARE * height / f * calibration.height_m
-
-    def prediction(i: int) -> Array | None:
-        if i == 0 or np.hypot(*steps[i, :2]) > reach:
+    reach = _PREDICTED_STEP_SHARE * height / f * height_m
+    tracker = Tracker(cell_px=CELL_PX // 2 if len(rotation) < FEW_PHOTOS else CELL_PX)
+    survived = np.ones(len(rotation))
+    for i in range(len(rotation)):
+        predicted = None  # tracking starts afresh
+        if i > 0 and np.hypot(*steps[i, :2]) <= reach:
+            step = np.array([steps[i, 0], steps[i, 1], 0.0])
+            predicted = predicted_homography(rotation[i - 1], rotation[i], height_m, step, matrix)
+        survived[i] = tracker.add(i, pictures.gray(i), predicted)
+        if hopeless(survived):
             return None
-        step = np.array([steps[i, 0], steps[i, 1], 0.0])
-        return predicted_homography(rotation[i - 1], rotation[i], calibration.height_m, step, matrix)
-
-    few = len(rotation) < FEW_PHOTOS
-    cell_px = CELL_PX // 2 if few else CELL_PX
-    return follow(len(rotation), pictures.gray, prediction, cell_px, hopeless)
+    return tracker.tracks()
 
 
 def _begin(records: FlightRecords, pictures: Pictures, calibration: Calibration, tracks: Tracks) -> Adjustment:
@@ -310,17 +312,11 @@ def height_prior(records: FlightRecords, calibration: Calibration) -> tuple[Arra
     smooth = np.array([np.median(z[max(0, i - reach) : i + reach + 1]) for i in range(len(z))])
     off = np.abs(z - smooth)
     leaps = off > _HEIGHT_LEAP_M
-    spikes = leaps & ~_climbed_to(records)
-    return np.where(spikes, smooth, z), np.where(leaps, off, FIRST_HEIGHT_SIGMA_M)
-
-
-def _climbed_to(records: FlightRecords) -> Flags:
-    """Heights that a vehicle reaches from those before and after in the time between them, bool (N,)."""
-    if not records.timed:
-        return np.zeros(len(records.position), bool)
-    rise = np.abs(np.diff(records.position[:, 2]))
-    can = rise <= _FASTEST_CLIMB_M_S * np.diff(records.time_s)
-    return np.asarray(np.concatenate([[True], can]) & np.concatenate([can, [True]]))
+    climbed = np.zeros(len(z), bool)  # heights that a vehicle reaches from those before and after in its time
+    if records.timed:
+        can = np.abs(np.diff(z)) <= _FASTEST_CLIMB_M_S * np.diff(records.time_s)
+        climbed = np.concatenate([[True], can]) & np.concatenate([can, [True]])
+    return np.where(leaps & ~climbed, smooth, z), np.where(leaps, off, FIRST_HEIGHT_SIGMA_M)
 
 
 def with_measured_headings(records: FlightRecords, tracks: Tracks) -> FlightRecords:
@@ -365,31 +361,3 @@ def _median_angle(angle: Array) -> float:
     far = np.abs(wrap_rad(angle[:, None] - angle)).sum(axis=1)
     first = angle[int(far.argmin())]
     return float(wrap_rad(first + np.median(wrap_rad(angle - first))))
-
-
-def best_views(
-    cameras: CameraBlock, tracks: Tracks, points: Array, obs_weight: Array, own: Flags | None = None
-) -> BestViews:
-    """Best view of each point; `own` bool (N,) limits the choice of camera."""
-    n = len(points)
-    distance = np.hypot(*(cameras.position[tracks.camera, :2] - points[tracks.point, :2]).T)
-    usable = obs_weight > INLIER_WEIGHT
-    if own is not None:
-        usable &= own[tracks.camera]
-    order = np.lexsort((np.where(usable, distance, np.inf), tracks.point))
-    first = np.searchsorted(tracks.point[order], np.arange(n))
-    best = order[np.minimum(first, len(order) - 1)]
-    total = np.bincount(tracks.point, minlength=n)
-    ok = (total > 0) & usable[best]
-    weight = np.bincount(tracks.point, obs_weight, minlength=n) / np.maximum(total, 1)
-    count = np.bincount(tracks.point[obs_weight > INLIER_WEIGHT], minlength=n)
-    return BestViews(np.where(ok, tracks.camera[best], -1).astype(np.int32), count.astype(np.int32), weight)
-
-
-def one_per_cell(points: Array, leg: Ints, cost: Array, cell_m: float) -> Indices:
-    """The point of least cost (finite) in each ground cell of each leg: indices, sorted."""
-    use = np.flatnonzero(np.isfinite(cost))
-    key = np.column_stack([np.floor(points[use, :2] / cell_m).astype(np.int64), leg[use]])
-    order = np.lexsort((use, cost[use]))
-    _, first = np.unique(key[order], axis=0, return_index=True)
-    return np.sort(use[order[first]])

@@ -59,18 +59,22 @@ _SPARSE_LEAST_FREEDOM: Final = 0.2  # least redundancy in that scaling, observat
 def solve_sparse(start: SparseStart) -> Adjustment:
     """Adjust cameras, lenses and points without a map; observations and attitudes get the sigmas of residuals."""
     schedule = tuple(zip(SPARSE_STAGE_C, _SPARSE_STAGE_STEPS, strict=True))
-    cameras, tracks = start.cameras, start.tracks
-    adjustment = Adjustment.begin(cameras, tracks, _priors(start), first_points(cameras, tracks))
+    points = first_points(start.cameras, start.tracks)
+    adjustment = Adjustment.begin(start.cameras, start.tracks, _priors(start), points)
+    plane = HeightPrior(np.zeros(len(points)), _SPARSE_PLANE_SIGMA_M, _SPARSE_PLANE_SOFT_SIGMA_M, c=_SPARSE_PLANE_C)
     for k, (c, steps) in enumerate(schedule):  # the first stage fixes the lens and assumes level ground
         if k == 1:
             _free_lens(adjustment, start, full=False)
-        if k >= 2:
-            _widen_position_sigmas(adjustment)
+        if k >= 2:  # positions and heights that scatter more than stated: too small sigmas push the cameras up
+            p = adjustment.priors
+            off = adjustment.position_residuals() / np.maximum(p.position_sigma, 1e-9)
+            across, up = max(mad_sigma(off[:, :2]), 1.0), max(mad_sigma(off[:, 2]), 1.0)
+            adjustment.priors = replace(p, position_sigma=p.position_sigma * [across, across, up])
         if k == len(schedule) - 1:  # k3 and principal point, too, of lenses with enough observations
             _attitude_sigmas_from_residuals(adjustment)
             _free_lens(adjustment, start, full=True)
         for _ in range(steps):
-            ground = plane_prior(adjustment) if k == 0 else datum_prior(adjustment)
+            ground = plane if k == 0 else datum_prior(adjustment)
             damping = _SPARSE_FIRST_DAMPING if k == 0 else _SPARSE_DAMPING
             move = adjustment.step(c, ground, damping=damping)
             if move < _converged_m(adjustment):
@@ -95,18 +99,11 @@ def _converged_m(adjustment: Adjustment) -> float:
     return _SPARSE_CONVERGED_SHARE * float(np.median(np.abs(adjustment.cameras.position[:, 2])))
 
 
-def plane_prior(adjustment: Adjustment) -> HeightPrior:
-    """A height prior for all points at 0."""
-    zero = np.zeros(len(adjustment.points))
-    return HeightPrior(zero, _SPARSE_PLANE_SIGMA_M, _SPARSE_PLANE_SOFT_SIGMA_M, c=_SPARSE_PLANE_C)
-
-
 def datum_prior(adjustment: Adjustment, level_m: float = 0.0) -> HeightPrior:
     """A prior that asks the median height of all points to be level_m, as one observation; their scatter stays free."""
     z = adjustment.points[:, 2]
-    middle = float(np.median(z)) if len(z) else 0.0
     soft = _SPARSE_DATUM_SIGMA_M * float(np.sqrt(max(len(z), 1)))
-    return HeightPrior(z - middle + level_m, NO_PRIOR_SIGMA_M, soft)
+    return HeightPrior(z - adjustment.ground_m + level_m, NO_PRIOR_SIGMA_M, soft)
 
 
 def _priors(start: SparseStart) -> Priors:
@@ -114,20 +111,6 @@ def _priors(start: SparseStart) -> Priors:
     lens = np.zeros((lenses, 6))
     lens[:, 0], lens[:, 1] = np.log(start.cameras.lens[:, F]), start.cameras.lens[:, K1]
     held = np.tile([_SPARSE_HELD_LENS_SIGMA, _SPARSE_HELD_LENS_SIGMA, 0.0, 0.0, 0.0, 0.0], (lenses, 1))
-    return Priors(
-        position=start.position_prior,
-        position_sigma=start.position_sigma,
-        rotation=start.cameras.rotation.copy(),
-        rotation_sigma=np.full((n, 3), np.radians(_SPARSE_FIRST_ATTITUDE_SIGMA_DEG)),
-        velocity=start.velocity,
-        group=start.records.segment,  # attitude bias, height offset and lag are common to a segment
-        models=_models(start),
-        lens=lens,
-        lens_sigma=held,
-    )
-
-
-def _models(start: SparseStart) -> tuple[GroupPriors, ...]:
     bx, by, bz = np.radians(_SPARSE_BIAS_SIGMA_DEG).tolist()
     models = []
     for s in range(int(start.records.segment.max()) + 1):
@@ -144,7 +127,17 @@ def _models(start: SparseStart) -> tuple[GroupPriors, ...]:
                 knot_every=_SPARSE_DRIFT_KNOT_PHOTOS,
             )
         )
-    return tuple(models)
+    return Priors(
+        position=start.position_prior,
+        position_sigma=start.position_sigma,
+        rotation=start.cameras.rotation.copy(),
+        rotation_sigma=np.full((n, 3), np.radians(_SPARSE_FIRST_ATTITUDE_SIGMA_DEG)),
+        velocity=start.velocity,
+        group=start.records.segment,  # attitude bias, height offset and lag are common to a segment
+        models=tuple(models),
+        lens=lens,
+        lens_sigma=held,
+    )
 
 
 def _free_lens(adjustment: Adjustment, start: SparseStart, *, full: bool) -> None:
@@ -164,15 +157,6 @@ def _free_lens(adjustment: Adjustment, start: SparseStart, *, full: bool) -> Non
     now = p.lens + adjustment.common[: 6 * lenses].reshape(-1, 6)
     adjustment.common[: 6 * lenses] = (now - lens).ravel()
     adjustment.priors = replace(p, lens=lens, lens_sigma=sigma)
-
-
-def _widen_position_sigmas(adjustment: Adjustment) -> None:
-    """Widen sigmas of positions and heights that scatter more than stated; too small ones push the cameras up."""
-    p = adjustment.priors
-    off = adjustment.position_residuals() / np.maximum(p.position_sigma, 1e-9)
-    horizontal = mad_sigma(off[:, :2])
-    scatter = np.array([horizontal, horizontal, mad_sigma(off[:, 2])])
-    adjustment.priors = replace(p, position_sigma=p.position_sigma * np.maximum(scatter, 1.0))
 
 
 def _attitude_sigmas_from_residuals(adjustment: Adjustment) -> None:

@@ -25,12 +25,7 @@ from orthoswarm.refine.features.flow_calibration import Calibration
 from orthoswarm.refine.features.working_pictures import Pictures, ReadGray
 from orthoswarm.refine.flight.record_findings import height_findings
 from orthoswarm.refine.flight.relative_block import FlightBlock
-from orthoswarm.refine.flight.sparse_adjustment import (
-    SPARSE_STAGE_C,
-    datum_prior,
-    solve_sparse,
-    trusted_heights,
-)
+from orthoswarm.refine.flight.sparse_adjustment import SPARSE_STAGE_C, datum_prior, solve_sparse, trusted_heights
 from orthoswarm.refine.flight.sparse_start import SparseStart, photo_legs, read_photo_records, sparse_start
 
 _JOINT_MOST_VEHICLES: Final = 16  # of more vehicles those with the same camera name share one lens (cost)
@@ -44,66 +39,33 @@ _HELD_ATTITUDE_SIGMA_DEG: Final = 0.3  # sigma of attitudes found together
 _HELD_LENS_SIGMA: Final = 0.003  # sigma of lens parameters found together
 
 
-def open_sparse_flight(
-    frames: Sequence[Frame],
-    grid: LocalGrid,
-    origin: Array,
-    read: ReadGray,
-    *,
-    run: Run = serial,
-    progress: Progress | None = None,
-) -> FlightBlock:
-    """Match the photos of one vehicle and lens, in order of time, with each other and adjust them without a map.
-
-    The counterpart of `open_flight` for photos that cannot be tracked; its adjustment is already solved. run, progress:
-    see `sparse_start`.
-    """
-    frames = [replace(frame, camera=frames[0].camera) for frame in frames]
-    start = sparse_start(frames, read_photo_records(frames, grid, origin), read, run, progress)
-    adjustment = solve_sparse(start)
-    trusted = trusted_heights(adjustment, start)
-    warnings = [*start.warnings, *height_findings(frames, start.records, start.plane, adjustment)]
-    return make_flight(
-        frames, grid, origin, read, start=start, rows=np.arange(len(frames)), adjustment=adjustment,
-        trusted_height=trusted, warnings=warnings,
-    )  # fmt: skip
+def open_sparse_flight(frames: Sequence[Frame], grid: LocalGrid, origin: Array, read: ReadGray) -> FlightBlock:
+    """The one flight of `open_sparse_flights`: the counterpart of `open_flight`; its adjustment is already solved."""
+    return open_sparse_flights([frames], grid, origin, read)[0]
 
 
-def make_flight(
-    frames: Sequence[Frame],
-    grid: LocalGrid,
-    origin: Array,
-    read: ReadGray,
-    *,
-    start: SparseStart,
-    rows: Indices,
-    adjustment: Adjustment,
-    trusted_height: Flags,
-    warnings: Sequence[str],
-    focal_sigma: float = 0.0,
-) -> FlightBlock:
-    """Make a vehicle's flight from photos adjusted alone or with others.
+def _flight(
+    frames: Sequence[Frame], grid: LocalGrid, origin: Array, read: ReadGray, *, start: SparseStart, rows: Indices,
+    adjustment: Adjustment, trusted_height: Flags, warnings: list[str], focal_sigma: float,
+) -> FlightBlock:  # fmt: skip
+    """A vehicle's flight from photos adjusted alone or with others.
 
-    Args:
-        start: of all photos that were matched together. rows: which of them are the vehicle's.
-        adjustment: of the vehicle's photos alone, in pixels of the full pictures.
-        trusted_height: bool, of all photos, True where the final adjustment used the recorded height.
-        warnings: for the report of this vehicle. focal_sigma: see `FlightBlock`.
+    start, trusted_height: of all photos that were matched together; rows: which of them are the vehicle's. adjustment:
+    of its photos alone, in pixels of the full pictures.
     """
     records = flight_records.read_records(frames, grid, origin)
     pictures = Pictures(frames, read)
     adjustment = in_reduced_pixels(adjustment, pictures.scale, pictures.size)
     number = {int(row): k for k, row in enumerate(rows)}
-    pictures.damaged.update({number[k]: start.reasons[k] for k in sorted(start.damaged) if k in number})
+    pictures.damaged.update({number[k]: start.damaged[k] for k in sorted(start.damaged) if k in number})
     yaw = wrap_rad(start.plane.yaw[rows])
-    mine = list(warnings)
     calibration = Calibration(
         focal_px=float(adjustment.cameras.lens[0, F]),
-        height_m=float(np.median(adjustment.cameras.position[:, 2] - _ground_level(adjustment))),
+        height_m=float(np.median(adjustment.cameras.position[:, 2] - adjustment.ground_m)),
         yaw_offset=wrap_rad(yaw - records.yaw),
         trusted_height=bool(trusted_height[rows].any()),
         pairs=start.pairs[1],
-        warnings=mine,
+        warnings=warnings,
     )
     leg = photo_legs(start.plane.position[rows], start.records.segment[rows], start.records.time_s[rows])
     return FlightBlock(
@@ -113,16 +75,10 @@ def make_flight(
         pictures=pictures,
         calibration=calibration,
         adjustment=adjustment,
-        survived=start.placed[rows].astype(np.float64),
-        warnings=list(mine),
+        warnings=list(warnings),
         sparse=True,
         focal_sigma=focal_sigma,
     )
-
-
-def _ground_level(adjustment: Adjustment) -> float:
-    """Median height of the points."""
-    return float(np.median(adjustment.points[:, 2])) if len(adjustment.points) else 0.0
 
 
 def in_reduced_pixels(adjustment: Adjustment, step: float, size: tuple[int, int]) -> Adjustment:
@@ -140,61 +96,48 @@ def in_reduced_pixels(adjustment: Adjustment, step: float, size: tuple[int, int]
     out.common[:] = adjustment.common
     out.common[: out.layout.lens_columns].reshape(-1, 6)[:, 4:] /= step
     # a step computes the weights and normal equations of the new adjustment
-    out.step(SPARSE_STAGE_C[-1], datum_prior(out, _ground_level(out)))
+    out.step(SPARSE_STAGE_C[-1], datum_prior(out, out.ground_m))
     return out
 
 
 def open_sparse_flights(
-    units: Sequence[Sequence[Frame]],
-    grid: LocalGrid,
-    origin: Array,
-    read: ReadGray,
-    *,
-    run: Run = serial,
+    units: Sequence[Sequence[Frame]], grid: LocalGrid, origin: Array, read: ReadGray, *, run: Run = serial,
     progress: Progress | None = None,
-) -> list[FlightBlock]:
-    """Match the photos of several vehicles with each other and adjust them together, without a map.
+) -> list[FlightBlock]:  # fmt: skip
+    """Match the photos of one or several vehicles with each other and adjust them together, without a map.
 
     units: frames of one vehicle and one lens each, in order of time. Returns a flight for each, whose adjustment
-    contains its own photos only, with priors at the joint solution: it may be moved rigidly (onto a map), but keeps its
-    shape.
+    contains its own photos only. Of several they have priors at the joint solution: such a flight may be moved rigidly
+    (onto a map), but keeps its shape. run, progress: see `sparse_start`.
     """
-    if len(units) == 1:
-        return [open_sparse_flight(units[0], grid, origin, read, run=run, progress=progress)]
     units = [[replace(frame, camera=part[0].camera) for frame in part] for part in units]
     frames = [frame for part in units for frame in part]
     records = read_photo_records(frames, grid, origin, share_lenses=True)
     start = sparse_start(frames, records, read, run, progress)
     adjustment = solve_sparse(start)
-    trusted = trusted_heights(adjustment, start)
-    focal_sigma = log_focal_sigmas(adjustment)[adjustment.cameras.lens_id]
-    if int(records.vehicle.max()) < _JOINT_MOST_VEHICLES:
-        adjustment = own_lenses(adjustment, start)
-        focal_sigma = np.hypot(focal_sigma, log_focal_sigmas(adjustment)[adjustment.cameras.lens_id])
-    found = height_findings(frames, start.records, start.plane, adjustment)
-    by_unit = _by_unit([*start.warnings, *found], [part[0].vehicle for part in units])
+    trusted, focal_sigma = trusted_heights(adjustment, start), np.zeros(len(frames))
+    if len(units) > 1:
+        focal_sigma = log_focal_sigmas(adjustment)[adjustment.cameras.lens_id]
+        if int(records.vehicle.max()) < _JOINT_MOST_VEHICLES:
+            adjustment = own_lenses(adjustment, start)
+            focal_sigma = np.hypot(focal_sigma, log_focal_sigmas(adjustment)[adjustment.cameras.lens_id])
+    names = [part[0].vehicle for part in units]
+    by_unit: list[list[str]] = [[] for _ in names]
+    for text in [*start.warnings, *height_findings(frames, start.records, start.plane, adjustment)]:
+        own = [k for k, name in enumerate(names) if text.startswith(f"{name}:")]
+        by_unit[own[0] if own else 0].append(text)  # those about several units go to the first one
     flights, first = [], 0
     for part, warnings in zip(units, by_unit, strict=True):
         rows = np.arange(first, first + len(part))
         first += len(part)
-        alone = _extract_block(adjustment, start, rows)
-        sigma = float(focal_sigma[rows[0]])
+        alone = _extract_block(adjustment, start, rows) if len(units) > 1 else adjustment
         flights.append(
-            make_flight(
+            _flight(
                 part, grid, origin, read, start=start, rows=rows, adjustment=alone, trusted_height=trusted,
-                warnings=warnings, focal_sigma=sigma,
+                warnings=warnings, focal_sigma=float(focal_sigma[rows[0]]),
             )
         )  # fmt: skip
     return flights
-
-
-def _by_unit(warnings: Sequence[str], names: Sequence[str]) -> list[list[str]]:
-    """Warnings by unit; those about several units go to the first one."""
-    by_unit: list[list[str]] = [[] for _ in names]
-    for text in warnings:
-        own = [k for k, name in enumerate(names) if text.startswith(f"{name}:")]
-        by_unit[own[0] if own else 0].append(text)
-    return by_unit
 
 
 def own_lenses(adjustment: Adjustment, start: SparseStart) -> Adjustment:
@@ -230,8 +173,7 @@ def _extract_block(adjustment: Adjustment, start: SparseStart, rows: Indices) ->
     lens_row = int(cameras.lens_id[0])
     cameras = replace(cameras, lens=cameras.lens[lens_row : lens_row + 1].copy(), lens_id=np.zeros(len(rows), np.int32))
     lens = np.concatenate([[np.log(cameras.lens[0, 0])], cameras.lens[0, 1:6]])[None]
-    free = adjustment.priors.lens_sigma[lens_row] > 0
-    width = cameras.lens[0, WIDTH]
+    free, width = adjustment.priors.lens_sigma[lens_row] > 0, cameras.lens[0, WIDTH]
     held = _HELD_LENS_SIGMA * np.array([1, 1, 1, 1, width, width])
     attitude = float(np.radians(_HELD_ATTITUDE_SIGMA_DEG))
     priors = Priors(

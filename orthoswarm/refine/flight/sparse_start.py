@@ -22,7 +22,7 @@ from orthoswarm.refine.bundle.block_arrays import HEIGHT, K1, WIDTH, CameraBlock
 from orthoswarm.refine.bundle.flight_records import column
 from orthoswarm.refine.features.pair_matching import build_tracks, thin_tracks
 from orthoswarm.refine.features.working_pictures import ReadGray
-from orthoswarm.refine.flight.record_findings import findings, unplaced_reasons
+from orthoswarm.refine.flight.record_findings import findings
 from orthoswarm.refine.initial.initial_orientation import InitialOrientation, find_initial_orientation
 from orthoswarm.refine.initial.pair_graph import PairGraphBuilder, build_pair_graph
 from orthoswarm.refine.initial.planar_network import LAG_SPREAD_S
@@ -60,8 +60,7 @@ class SparseStart:
         position_sigma: float64 (N, 3), one sigma east, north, up. height_known: bool (N,), whether heights are recorded
             and possible. velocity: float64 (N, 2), metres per second.
         log_focal: float64 (L,) by the tags (75 degrees without), pixels. log_focal_sigma: float64 (L,).
-        placed: bool (N,), False where a photo has no tie points to others. reasons: photo -> why not.
-        damaged: photos that cannot be decoded.
+        damaged: photos that cannot be used, and why.
         warnings: for the report. plane: the planar start values.
         records: what the photos recorded. pairs: pairs tried and matched.
     """
@@ -74,9 +73,7 @@ class SparseStart:
     velocity: Array
     log_focal: Array
     log_focal_sigma: Array
-    placed: Flags
-    reasons: dict[int, str]
-    damaged: frozenset[int]
+    damaged: dict[int, str]
     warnings: list[str]
     plane: InitialOrientation
     records: PhotoRecords
@@ -128,12 +125,9 @@ def read_photo_records(
 
 
 def sparse_start(
-    frames: Sequence[Frame],
-    records: PhotoRecords,
-    read_gray: ReadGray,
-    run: Run = serial,
+    frames: Sequence[Frame], records: PhotoRecords, read_gray: ReadGray, run: Run = serial,
     progress: Progress | None = None,
-) -> SparseStart:
+) -> SparseStart:  # fmt: skip
     """Match photos with each other and find start values; run: executes tasks, the result does not depend on it."""
     builder = PairGraphBuilder(frames=frames, records=records, read_gray=read_gray, run=run, progress=progress)
     start = build_pair_graph(builder)
@@ -152,11 +146,14 @@ def assemble(builder: PairGraphBuilder, records: PhotoRecords, start: InitialOri
     tracks = thin_tracks(build_tracks(builder.features, trusted), records.width, records.rows)
     position, sigma, known = _position_priors(records, start)
     log_focal, log_focal_sigma = focal_by_hint(records)
-    held = np.zeros(len(frames), bool)
-    held[np.unique(tracks.camera)] = True
     velocity = records.velocity()
+    below = np.stack([start.position.real, start.position.imag, start.height], axis=1)
+    first = [int(np.argmax(records.lens == k)) for k in range(len(start.focal))]
+    lens = np.zeros((len(start.focal), 8))
+    lens[:, F], lens[:, K1] = start.focal, start.k1
+    lens[:, WIDTH], lens[:, HEIGHT] = records.width[first], records.rows[first]
     return SparseStart(
-        cameras=_camera_block(records, start),
+        cameras=CameraBlock(below, start.rotation(), records.lens.astype(np.int32), lens),
         tracks=tracks,
         position_prior=position,
         position_sigma=sigma,
@@ -164,23 +161,12 @@ def assemble(builder: PairGraphBuilder, records: PhotoRecords, start: InitialOri
         velocity=np.stack([velocity.real, velocity.imag], axis=1),
         log_focal=log_focal,
         log_focal_sigma=log_focal_sigma,
-        placed=held,
-        reasons=unplaced_reasons(frames, records, held, builder.damaged),
-        damaged=frozenset(builder.damaged),
+        damaged=dict(builder.damaged),
         warnings=findings(frames, records, start),
         plane=start,
         records=records,
         pairs=(len(builder.tried), len(pairs)),
     )
-
-
-def _camera_block(records: PhotoRecords, start: InitialOrientation) -> CameraBlock:
-    position = np.stack([start.position.real, start.position.imag, start.height], axis=1)
-    lens = np.zeros((len(start.focal), 8))
-    first = [int(np.argmax(records.lens == k)) for k in range(len(start.focal))]
-    lens[:, F], lens[:, K1] = start.focal, start.k1
-    lens[:, WIDTH], lens[:, HEIGHT] = records.width[first], records.rows[first]
-    return CameraBlock(position, start.rotation(), records.lens.astype(np.int32), lens)
 
 
 def _position_priors(records: PhotoRecords, start: InitialOrientation) -> tuple[Array, Array, Flags]:
@@ -245,11 +231,10 @@ def group_focal_lengths(log_focal: Array, sigma: Array, sure: Flags) -> Ints:
     for v in sorted(range(len(log_focal)), key=lambda v: (not sure[v], sigma[v])):
         off = np.abs(log_focal[v] - mean)
         near = int(off.argmin()) if len(off) else -1
-        limit = 0.0
-        if near >= 0:
-            total_sigma = float(np.hypot(sigma[v], weight[near] ** -0.5))
-            limit = max(_UNLIKE_SHARE, _UNLIKE_SIGMAS * total_sigma)
-        if near < 0 or (sure[v] and off[near] > limit):
+        limit = np.inf
+        if sure[v] and near >= 0:
+            limit = max(_UNLIKE_SHARE, _UNLIKE_SIGMAS * float(np.hypot(sigma[v], weight[near] ** -0.5)))
+        if near < 0 or off[near] > limit:
             group[v] = len(mean)
             weight, mean = np.append(weight, sigma[v] ** -2), np.append(mean, log_focal[v])
             continue

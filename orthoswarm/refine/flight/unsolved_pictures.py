@@ -100,7 +100,7 @@ def place_by_neighbours(
     before = {p.frame.image: p for p in recorded}
     pairs = [(before[p.frame.image], p) for p in refined if p.frame.image in before]
     pairs = [pair for pair in pairs if not pair[1].weak] or pairs
-    return [_moved_like(_nearest(one, pairs), one) for one in odd] if pairs else list(odd)
+    return [_moved_with(one, pairs) for one in odd] if pairs else list(odd)
 
 
 def move_with_neighbours(
@@ -112,15 +112,11 @@ def move_with_neighbours(
     return [replace(now, sigma_m=was.sigma_m, weak=was.weak) for was, now in zip(extra, moved, strict=True)]
 
 
-def _nearest(one: PlacedFrame, pairs: Sequence[BeforeAfter]) -> list[BeforeAfter]:
-    """The refined frames nearest to a frame, of its own vehicle if there are any."""
-    own = [pair for pair in pairs if pair[0].frame.vehicle == one.frame.vehicle] or list(pairs)
+def _moved_with(one: PlacedFrame, pairs: Sequence[BeforeAfter]) -> PlacedFrame:
+    """A frame moved by the median shift of the nearest ones, of its vehicle if any, and turned like the first."""
+    own = [pair for pair in pairs if pair[0].frame.vehicle == one.frame.vehicle] or pairs
     away = [float(np.hypot(*(p.camera.nadir - one.camera.nadir))) for p, _ in own]
-    return [own[i] for i in np.argsort(away, kind="stable")[:_UNSOLVED_NEIGHBOURS]]
-
-
-def _moved_like(near: Sequence[BeforeAfter], one: PlacedFrame) -> PlacedFrame:
-    """A frame moved by its neighbours' median shift, rotated and scaled like the nearest one."""
+    near = [own[i] for i in np.argsort(away, kind="stable")[:_UNSOLVED_NEIGHBOURS]]
     shift = np.median([after.camera.position - old.camera.position for old, after in near], axis=0)
     old, after = near[0]
     turn = after.camera.rotation @ old.camera.rotation.T

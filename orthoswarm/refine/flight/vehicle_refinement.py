@@ -149,14 +149,11 @@ def _absorb(groups: dict[tuple[str, int, int], list[Frame]]) -> list[list[Frame]
         main = max(keys, key=lambda k: len(groups[k]))
         for key in keys:
             if key != main and len(groups[key]) < _OWN_UNIT_PHOTOS:
-                groups[main] = _in_order([*groups[main], *groups.pop(key)])
+                together = [*groups[main], *groups.pop(key)]
+                timed = all(f.time_s is not None for f in together)
+                groups[main] = sorted(together, key=lambda f: (f.time_s or 0.0, f.image) if timed else (0.0, f.image))
         out += [groups[k] for k in keys if k in groups]
     return out
-
-
-def _in_order(frames: list[Frame]) -> list[Frame]:
-    timed = all(f.time_s is not None for f in frames)
-    return sorted(frames, key=lambda f: (f.time_s or 0.0, f.image) if timed else (0.0, f.image))
 
 
 def merge_units(solutions: Sequence[Solution]) -> list[Solution]:

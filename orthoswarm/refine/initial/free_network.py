@@ -53,10 +53,9 @@ class Anchors:
 class FreeNetwork:
     """N photos on the ground.
 
-    Attributes:
-        scale: complex (N,), a of each photo: metres per pixel times exp(-i yaw). centre: complex (N,), t: below the
-            camera. sigma_m: float64 (N,), one sigma of the centre, an axis. placed: bool (N,).
-        left: photos that pairs connect, but that could not be placed, the largest part first.
+    scale: complex (N,), a of each photo: metres per pixel times exp(-i yaw). centre: complex (N,), t: below the camera.
+    sigma_m: float64 (N,), one sigma of the centre, an axis. placed: bool (N,). left: photos that pairs connect but that
+    could not be placed, the largest part first.
     """
 
     scale: Complex
@@ -76,7 +75,11 @@ def solve_free_network(graph: PairGraph, count: int, width: Array, anchors: Anch
     scale, centre = np.zeros(count, np.complex128), np.zeros(count, np.complex128)
     sigma, placed = np.full(count, np.inf), np.zeros(count, bool)
     left: list[Ints] = []
-    for members in _parts(graph, count):
+    label = components(graph, count)
+    for k in range(int(label.max(initial=-1)) + 1):  # the largest part first
+        members = np.flatnonzero(label == k).astype(np.int32)
+        if len(members) < 2:
+            continue
         inside = np.isin(graph.first, members)
         held = np.flatnonzero(np.isin(anchors.photo, members))
         a, t = _chained(graph, inside, members, count)
@@ -94,13 +97,6 @@ def solve_free_network(graph: PairGraph, count: int, width: Array, anchors: Anch
     return FreeNetwork(scale=scale, centre=centre, sigma_m=sigma, placed=placed, left=left)
 
 
-def _parts(graph: PairGraph, count: int) -> list[Ints]:
-    """Photos connected by pairs, the largest part first; photos without a pair are left out."""
-    label = components(graph, count)
-    groups = [np.flatnonzero(label == k).astype(np.int32) for k in range(int(label.max(initial=-1)) + 1)]
-    return [group for group in groups if len(group) > 1]
-
-
 def _chained(graph: PairGraph, inside: Flags, members: Ints, count: int) -> tuple[Complex, Complex]:
     """Similarities (N,) of a part's photos onto the pixels of one of them, along the pairs with most matches."""
     pairs = np.flatnonzero(inside)
@@ -111,18 +107,18 @@ def _chained(graph: PairGraph, inside: Flags, members: Ints, count: int) -> tupl
     root = int(np.bincount(np.r_[first, second], minlength=count).argmax())
     order, before = breadth_first_order(tree, root, directed=False)
     a, t = np.zeros(count, np.complex128), np.zeros(count, np.complex128)
+    a, t = np.zeros(count, np.complex128), np.zeros(count, np.complex128)
     a[root] = 1.0
-    for k in order[1:]:
+    for k in order[1:].tolist():
         j = int(before[k])
-        forward = (j, int(k)) in number
-        e = number[(j, int(k)) if forward else (int(k), j)]
-        f, c, d = graph.factor[e], graph.centre_first[e], graph.centre_second[e]
-        if forward:  # z of k = f z of j + constant
-            a[k] = a[j] / f
-            t[k] = t[j] + a[j] * c - a[k] * d
+        e = number.get((j, k))
+        if e is not None:  # z of k = f z of j + constant
+            a[k] = a[j] / graph.factor[e]
+            t[k] = t[j] + a[j] * graph.centre_first[e] - a[k] * graph.centre_second[e]
         else:
-            a[k] = a[j] * f
-            t[k] = t[j] + a[j] * d - a[k] * c
+            e = number[k, j]
+            a[k] = a[j] * graph.factor[e]
+            t[k] = t[j] + a[j] * graph.centre_second[e] - a[k] * graph.centre_first[e]
     return a, t
 
 
@@ -172,16 +168,12 @@ def _adjusted(
         step = factor.solve(matrix.conj().T @ (weight * rhs))
         log_a, t = log_a + step[:n], t + step[n:]
     held = anchors.take(np.flatnonzero(squared[2 * pairs :] <= _FREE_SCHEDULE[-1]))
-    if (together <= _FREE_SCHEDULE[-1]).mean() < _AGREE_SHARE or not _spread(held):
+    place, sigma = held.ground, held.sigma_m
+    spread = any(not _near(g - place[0], s, sigma[0]) for g, s in zip(place, sigma, strict=True))
+    if (together <= _FREE_SCHEDULE[-1]).mean() < _AGREE_SHARE or not spread:
         return None
     variance = np.diag(factor.solve(np.eye(2 * n, dtype=np.complex128)))[n:].real
     return np.exp(log_a), t, np.sqrt(np.maximum(variance, 0.0))
-
-
-def _spread(anchors: Anchors) -> bool:
-    """Whether some anchors lie far enough from the first one to turn and scale photos."""
-    ground, sigma = anchors.ground, anchors.sigma_m
-    return any(not _near(g - ground[0], s, sigma[0]) for g, s in zip(ground, sigma, strict=True))
 
 
 def _rows(

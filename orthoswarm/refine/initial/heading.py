@@ -79,12 +79,8 @@ def course_headings(
 ) -> tuple[Array, Array]:
     """Absolute heading of each pair's first photo, from the recorded movement and the picture's shift.
 
-    Args:
-        graph: E pairs. metres: float64 (N,), metres per pixel. offset: complex (N,), nadir pixel of each photo.
-        offset_sigma_px: float64 (N,).
-
-    Returns:
-        Heading (E,) and its one sigma (E,), infinite where the movement is too short.
+    metres: float64 (N,), metres per pixel. offset: complex (N,), nadir pixel of each photo; offset_sigma_px: float64
+    (N,). Returns the headings (E,) and their one sigma (E,), infinite where the movement is too short.
     """
     i, j = graph.first, graph.second
     back = np.conj(graph.turn)

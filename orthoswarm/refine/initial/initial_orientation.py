@@ -46,7 +46,6 @@ _FOCAL_CHANGE: Final = 0.03  # a focal length by height that differs by more is 
 _ROUNDS: Final = 2  # rounds of shapes, headings, scales and network (a third changed nothing)
 _LINK_SIGMA: Final = 0.15  # relative sigma of a segment's ground scale about its lens's
 _LINK_HEIGHT_SIGMA: Final = 0.03  # the same where recorded heights scale it
-_LENS_SCALE_SIGMA: Final = 0.5  # relative sigma of a lens's ground scale
 _COURSE_LEAST_M_S: Final = 0.3  # slower photos have no course for a heading
 
 
@@ -117,7 +116,8 @@ def find_initial_orientation(
         focal = np.exp(shape.log_focal)
         heights = recorded_heights(records, metres * focal[lens_of])
         by_height = focal_by_height(records, heights, metres, lens_of)
-        if round_ == 0 or _differs(by_height, focal):
+        differs = np.isfinite(by_height) & (np.abs(np.log(by_height / focal)) > _FOCAL_CHANGE)
+        if round_ == 0 or differs.any():
             shape = shape_of(matches, records, *_combine(hint, hint_sigma, by_height))
             graph = similarities(matches, records, shape)
             focal = np.exp(shape.log_focal)
@@ -129,9 +129,13 @@ def find_initial_orientation(
         yaw, yaw_known = solve_headings(graph, component, yaw, course, sigma)
         link, link_sigma = _links(heights, lens_of, by_height)
         priors = NetworkPriors(
-            metres=metres, relief=relative, link=link, link_sigma=link_sigma, metres_sigma=_LENS_SCALE_SIGMA,
-            offset_sigma=tilt_px, lens=lens_of,
-        )  # fmt: skip
+            metres=metres,
+            relief=relative,
+            link=link,
+            link_sigma=link_sigma,
+            offset_sigma=tilt_px,
+            lens=lens_of,
+        )
         network = solve_network(graph, records, yaw, priors)
         metres = network.metres
     level = shape.level.copy()
@@ -166,13 +170,12 @@ def find_initial_orientation(
 def shape_of(matches: PairMatches, records: PhotoRecords, log_focal: Array, log_focal_sigma: Array) -> TiltAndLens:
     """Tilt of each segment and lens, with the priors of its tags; log_focal, log_focal_sigma: float64 (L,), priors."""
     tagged = np.isfinite(records.pitch)
-    segments = int(records.segment.max()) + 1
-    share = np.array([tagged[records.segment == s].mean() for s in range(segments)])
+    share = np.array([tagged[records.segment == s].mean() for s in range(int(records.segment.max()) + 1)])
     tilt_sigma = np.radians(np.where(share > _TAG_TILT_SHARE, _TAG_TILT_SIGMA_DEG, _FREE_TILT_SIGMA_DEG))
-    level = records.tag_level()
     return solve_tilt_and_lens(
-        matches, records, level, log_focal=log_focal, log_focal_sigma=log_focal_sigma, tilt_sigma=tilt_sigma
-    )
+        matches, records, records.tag_level(), log_focal=log_focal, log_focal_sigma=log_focal_sigma,
+        tilt_sigma=tilt_sigma,
+    )  # fmt: skip
 
 
 def _combine(log_focal: Array, sigma: Array, by_height: Array) -> tuple[Array, Array]:
@@ -180,10 +183,6 @@ def _combine(log_focal: Array, sigma: Array, by_height: Array) -> tuple[Array, A
     weight = np.where(np.isfinite(by_height), _HEIGHT_FOCAL_SIGMA**-2, 0.0)
     total = sigma**-2 + weight
     return (log_focal * sigma**-2 + weight * np.log(np.where(weight > 0, by_height, 1.0))) / total, total**-0.5
-
-
-def _differs(one: Array, two: Array) -> bool:
-    return bool(np.any(np.isfinite(one) & (np.abs(np.log(one / two)) > _FOCAL_CHANGE)))
 
 
 def _links(heights: RecordedHeights, lens_of: Ints, by_height: Array) -> tuple[Array, Array]:

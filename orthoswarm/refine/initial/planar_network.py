@@ -26,6 +26,7 @@ _PAIR_SIGMA_M: Final = 0.6  # sigma of a pair's vector
 _PAIR_SIGMA_SHARE: Final = 0.05  # ... and this share of the distance of its matches from the nadirs
 LAG_SPREAD_S: Final = 0.3  # scatter of the delay of recorded positions along the way
 _NETWORK_STILL_M_S: Final = 0.1  # a slower vehicle has no direction along the way
+_LENS_SCALE_SIGMA: Final = 0.5  # relative sigma of a lens's ground scale
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,7 +37,6 @@ class NetworkPriors:
         metres: float64 (S,), metres per pixel. relief: float64 (N,), factor on it for each photo (the photo's height
             over its segment's).
         link: float64 (S,), metres per pixel of a segment over its lens's; link_sigma: float64 (S,), relative sigma.
-        metres_sigma: relative sigma of each lens's metres per pixel.
         offset_sigma: float64 (S,), pixels, of the nadir's offset from 0.
         lens: int32 (S,), lens of each segment.
     """
@@ -45,7 +45,6 @@ class NetworkPriors:
     relief: Array
     link: Array
     link_sigma: Array
-    metres_sigma: float
     offset_sigma: Array
     lens: Ints
 
@@ -54,10 +53,9 @@ class NetworkPriors:
 class Network:
     """Result of the network.
 
-    Attributes:
-        position: complex (N,). metres: float64 (S,). offset: complex (S,), nadir pixel. offset_sigma: float64 (S,).
-        lag: float64 (V,) seconds. pair_ok: bool (E,). gps_ok: bool (N,).
-        gps_residual: complex (N,), recorded position minus the network's, lag removed.
+    position: complex (N,). metres: float64 (S,). offset: complex (S,), nadir pixel. offset_sigma: float64 (S,). lag:
+    float64 (V,) seconds. pair_ok: bool (E,). gps_ok: bool (N,). gps_residual: complex (N,), recorded position minus the
+    network's, lag removed.
     """
 
     position: Complex
@@ -85,12 +83,6 @@ class _NetworkColumns(NamedTuple):
     lens: int
     lag: int
     size: int
-
-    @classmethod
-    def of(cls, n: int, s: int, lenses: int, v: int) -> "_NetworkColumns":
-        """The columns for so many photos, segments, lenses and vehicles."""
-        first = np.cumsum([2 * n, s, 2 * s, lenses, v]).tolist()
-        return cls(n, s, lenses, v, *first)
 
 
 @dataclass(slots=True)
@@ -122,9 +114,8 @@ class SparseRows:
 
 def solve_network(graph: PairGraph, records: PhotoRecords, yaw: Array, beliefs: NetworkPriors) -> Network:
     """Solve positions, scale, nadir offset and lag of N photos; yaw: float64 (N,), their headings."""
-    at = _NetworkColumns.of(
-        len(records), len(beliefs.metres), int(beliefs.lens.max()) + 1, int(records.vehicle.max()) + 1
-    )
+    n, s, lenses, v = len(records), len(beliefs.metres), int(beliefs.lens.max()) + 1, int(records.vehicle.max()) + 1
+    at = _NetworkColumns(n, s, lenses, v, *np.cumsum([2 * n, s, 2 * s, lenses, v]).tolist())
     rows = SparseRows(at.size)
     _pair_rows(rows, at, graph, records=records, unit=np.exp(-1j * yaw), b=beliefs)
     velocity = _gps_rows(rows, at, records)
@@ -146,15 +137,19 @@ def solve_network(graph: PairGraph, records: PhotoRecords, yaw: Array, beliefs: 
     metres = x[at.metres : at.offset]
     q = x[at.offset : at.lens].reshape(2, -1)
     lag = x[at.lag :]
+    position = x[:photos] + 1j * x[photos : 2 * photos]
+    picks = np.zeros((at.size, 2 * at.segments))
+    picks[at.offset + np.arange(2 * at.segments), np.arange(2 * at.segments)] = 1.0
+    variance = np.einsum("ij,ij->j", picks, factor.solve(picks))  # of m o
     return Network(
-        position=x[:photos] + 1j * x[photos : 2 * photos],
+        position=position,
         metres=metres,
         offset=(q[0] + 1j * q[1]) / metres,
-        offset_sigma=_sigmas(factor, at).max(0) / metres,
+        offset_sigma=np.sqrt(np.maximum(variance, 0.0)).reshape(2, -1).max(0) / metres,
         lag=lag,
         pair_ok=_norm(residual[: 2 * pairs]) < NETWORK_GATE_SIGMAS,
         gps_ok=_norm(residual[2 * pairs : 2 * (pairs + photos)]) < NETWORK_GATE_SIGMAS,
-        gps_residual=records.position + lag[records.vehicle] * velocity - (x[:photos] + 1j * x[photos : 2 * photos]),
+        gps_residual=records.position + lag[records.vehicle] * velocity - position,
     )
 
 
@@ -166,14 +161,6 @@ def _norm(residual: Array) -> Array:
 def _robust(residual: Array, c: float) -> Array:
     """Weights of both rows of stacked residual vectors."""
     return np.tile(robust_widening(_norm(residual) ** 2, c) ** -2, 2)
-
-
-def _sigmas(factor: Any, at: _NetworkColumns) -> Array:
-    """One sigma of m o, float64 (2, S), from the factor of the normal equations."""
-    picks = np.zeros((at.size, 2 * at.segments))
-    picks[at.offset + np.arange(2 * at.segments), np.arange(2 * at.segments)] = 1.0
-    variance = np.einsum("ij,ij->j", picks, factor.solve(picks))
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)).reshape(2, -1))
 
 
 def _pair_rows(
@@ -224,5 +211,5 @@ def _prior_rows(rows: SparseRows, at: _NetworkColumns, b: NetworkPriors) -> None
     for part in (0, at.segments):
         rows.add(np.zeros(at.segments), (at.offset + part + segment, 1.0 / (b.offset_sigma * b.metres)))
     expected = np.array([np.median((b.metres / b.link)[b.lens == k]) for k in range(at.lenses)])
-    rows.add(np.full(at.lenses, 1.0 / b.metres_sigma), (at.lens + lens, 1.0 / (b.metres_sigma * expected)))
+    rows.add(np.full(at.lenses, 1.0 / _LENS_SCALE_SIGMA), (at.lens + lens, 1.0 / (_LENS_SCALE_SIGMA * expected)))
     rows.add(np.zeros(at.vehicles), (at.lag + vehicle, 1.0 / LAG_SIGMA_S))

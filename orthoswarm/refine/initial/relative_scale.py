@@ -36,10 +36,8 @@ _HEIGHT_RATIO: Final = 5.0  # a height beyond this factor of its segment's, eith
 class RecordedHeights:
     """Recorded heights as evidence of scale.
 
-    Attributes:
-        relative: float64 (N,), height of each photo over its segment's median, 1 where unknown.
-        known: bool (N,), whether `relative` is recorded.
-        segment: float64 (S,), median recorded height of each segment above takeoff or ground, NaN where unknown.
+    relative: float64 (N,), height of each photo over its segment's median, 1 where unknown. known: bool (N,), whether
+    it is recorded. segment: float64 (S,), median recorded height of each segment above takeoff or ground, or NaN.
     """
 
     relative: Array

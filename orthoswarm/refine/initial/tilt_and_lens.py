@@ -92,20 +92,13 @@ def spaced(count: int, most: int) -> NDArray[np.intp]:
 
 
 def solve_tilt_and_lens(
-    matches: PairMatches,
-    records: PhotoRecords,
-    level: Array,
-    *,
-    log_focal: Array,
-    log_focal_sigma: Array,
+    matches: PairMatches, records: PhotoRecords, level: Array, *, log_focal: Array, log_focal_sigma: Array,
     tilt_sigma: Array,
-) -> TiltAndLens:
+) -> TiltAndLens:  # fmt: skip
     """Find the tilt, focal length and first radial term for which the matches of every pair fit a similarity best.
 
-    Args:
-        level: float64 (N, 3, 3), camera to level camera by the tags (identity if there are none). tilt_sigma: float64
-            (S,), one sigma of the tilt about it, radians.
-        log_focal: float64 (L,), prior. log_focal_sigma: float64 (L,), its one sigma.
+    level: float64 (N, 3, 3), camera to level camera by the tags (identity if there are none). tilt_sigma: float64 (S,),
+    one sigma of the tilt about it, radians. log_focal: float64 (L,), prior, and its one sigma.
     """
     segments, lenses = int(records.segment.max()) + 1, len(log_focal)
     size = 2 * segments + 2 * lenses

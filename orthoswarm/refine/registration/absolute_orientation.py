@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.robust_kernel import robust_weights
 from orthoswarm.model.arrays import Array, Flags, Indices, Ints
@@ -16,7 +15,7 @@ from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.model.robust import mad_sigma
 from orthoswarm.refine.bundle.adjustment import TRACK_ROBUST_C, Adjustment, MapTies
-from orthoswarm.refine.flight.relative_block import BestViews, FlightBlock, one_per_cell
+from orthoswarm.refine.flight.relative_block import BestViews, FlightBlock
 from orthoswarm.refine.registration.coarse_registration import CoarseFit, shift_cameras
 from orthoswarm.refine.registration.map_evidence import FALSE_MATCHES, false_matches_log10
 from orthoswarm.refine.registration.tie_points import LINK_CELL_M, LoadedMap, MapMatches, link_legs, match_points
@@ -100,16 +99,10 @@ def load_map(flight: FlightBlock, basemap: MapWindow, origin: Array, gsd_m: floa
 
 
 def tie_matches(
-    flight: FlightBlock,
-    surface: GroundModel,
-    ground: LoadedMap,
-    *,
-    cell_m: float,
-    reach_m: float,
-    half_m: float | None = None,
-    pictures: Flags | None = None,
-) -> MapMatches:
-    """Match ground points, one for each cell and leg, to the map; `clear_matches` tells the sure ones.
+    flight: FlightBlock, surface: GroundModel, ground: LoadedMap, *, cell_m: float, reach_m: float,
+    half_m: float | None = None, pictures: Flags | None = None,
+) -> MapMatches:  # fmt: skip
+    """Sure matches of ground points, one for each cell and leg, with the map.
 
     Ground is compared by its texture: strong edges belong to what leans and casts shadows.
 
@@ -118,49 +111,17 @@ def tie_matches(
     """
     adj = flight.adjustment
     seen = flight.best_views(pictures)
-    height = adj.points[:, 2] - surface.height(adj.points[:, :2])
+    level = surface.height(adj.points[:, :2])
+    height = np.abs(adj.points[:, 2] - level)
     fewest = _TIE_VIEWS_SPARSE if flight.sparse else TIE_VIEWS
-    usable = (seen.camera >= 0) & (seen.count >= fewest) & (seen.mean_weight > _TIE_VIEW_WEIGHT)
-    usable &= np.abs(height) < TIE_HEIGHT_M
-    leg = flight.leg[np.maximum(seen.camera, 0)]
-    chosen = one_per_cell(adj.points, leg, np.where(usable, np.abs(height), np.inf), cell_m)
-    return _ground_matches(
-        flight,
-        surface,
-        ground,
-        chosen=chosen,
-        camera=seen.camera,
-        reach_m=reach_m,
-        half_m=half_m or tie_half_m(flight),
-        texture=True,
-    )
-
-
-def _ground_matches(
-    flight: FlightBlock,
-    surface: GroundModel,
-    ground: LoadedMap,
-    *,
-    chosen: NDArray[np.integer],
-    camera: Ints,
-    reach_m: float,
-    half_m: float,
-    texture: bool,
-) -> MapMatches:
-    """Chosen points found on the map, rectified on the ground."""
-    adj = flight.adjustment
-    return match_points(
-        adj.cameras,
-        adj.points,
-        chosen,
-        camera=camera,
-        gray=flight.pictures.gray,
-        ground=ground,
-        half=max(TIE_HALF_PX, round(half_m / ground.gsd_m)),
+    usable = (seen.count >= fewest) & (seen.mean_weight > _TIE_VIEW_WEIGHT) & (height < TIE_HEIGHT_M)
+    found = match_points(
+        adj.cameras, adj.points, flight.one_per_cell(seen, usable, height, cell_m), camera=seen.camera,
+        gray=flight.pictures.gray, ground=ground, level=level, texture=True,
+        half=max(TIE_HALF_PX, round((half_m or tie_half_m(flight)) / ground.gsd_m)),
         reach=max(TIE_REACH_PX, round(reach_m / ground.gsd_m)),
-        level=surface.height(adj.points[:, :2]),
-        texture=texture,
-    )
+    )  # fmt: skip
+    return clear_matches(found)
 
 
 def edge_displacement(flight: FlightBlock, surface: GroundModel, ground: LoadedMap, matches: MapMatches) -> Array:
@@ -170,13 +131,15 @@ def edge_displacement(flight: FlightBlock, surface: GroundModel, ground: LoadedM
     this difference (regression over simulated cities with exact truth). Subtracting it extrapolates to ground without
     edges.
     """
+    adj = flight.adjustment
     step = max(1, -(-len(matches.point) // _EDGE_MOST))
     some = matches.take(np.arange(0, len(matches.point), step))
-    camera = np.full(len(flight.adjustment.points), -1, np.int32)
+    camera = np.full(len(adj.points), -1, np.int32)
     camera[some.point] = some.camera
-    found = _ground_matches(
-        flight, surface, ground, chosen=some.point, camera=camera, reach_m=_EDGE_SEARCH_M,
-        half_m=tie_half_m(flight), texture=False,
+    found = match_points(
+        adj.cameras, adj.points, some.point, camera=camera, gray=flight.pictures.gray, ground=ground,
+        half=max(TIE_HALF_PX, round(tie_half_m(flight) / ground.gsd_m)),
+        reach=max(TIE_REACH_PX, round(_EDGE_SEARCH_M / ground.gsd_m)), level=surface.height(adj.points[:, :2]),
     )  # fmt: skip
     edges = clear_matches(found)
     _, mine, its = np.intersect1d(some.point, edges.point, return_indices=True)
@@ -256,33 +219,18 @@ def as_ties(matches: MapMatches, points: Array) -> MapTies:
     return MapTies(matches.point, points[matches.point, :2] + matches.shift, sigma)
 
 
-def with_sigma_of_residuals(ties: MapTies, residual: Array) -> MapTies:
-    """The same tie points with the sigma that their residuals show: decimetres on new maps, a metre on old ones."""
-    if len(residual) < _TIE_FEWEST_FOR_SIGMA:
-        return ties
-    sigma = float(np.clip(mad_sigma(residual), *_TIE_SIGMA_LIMITS_M))
-    return replace(ties, sigma_m=np.full(len(ties.point), sigma))
-
-
 def roof_matches(flight: FlightBlock, surface: GroundModel, ground: LoadedMap) -> tuple[MapMatches, Array]:
     """Matches of raised points (roofs) with the map, and their heights over the ground (Q,), metres."""
     adj = flight.adjustment
     seen = flight.best_views()
     height = adj.points[:, 2] - surface.height(adj.points[:, :2])
-    usable = (seen.camera >= 0) & (seen.count >= _ROOF_VIEWS) & (seen.mean_weight > _ROOF_VIEW_WEIGHT)
+    usable = (seen.count >= _ROOF_VIEWS) & (seen.mean_weight > _ROOF_VIEW_WEIGHT)
     usable &= (height > _ROOF_HEIGHTS_M[0]) & (height < _ROOF_HEIGHTS_M[1])
-    leg = flight.leg[np.maximum(seen.camera, 0)]
-    chosen = one_per_cell(adj.points, leg, np.where(usable, -seen.count.astype(float), np.inf), _ROOF_CELL_M)
     found = match_points(
-        adj.cameras,
-        adj.points,
-        chosen,
-        camera=seen.camera,
-        gray=flight.pictures.gray,
-        ground=ground,
-        half=max(TIE_HALF_PX, round(_ROOF_HALF_M / ground.gsd_m)),
+        adj.cameras, adj.points, flight.one_per_cell(seen, usable, -seen.count, _ROOF_CELL_M), camera=seen.camera,
+        gray=flight.pictures.gray, ground=ground, half=max(TIE_HALF_PX, round(_ROOF_HALF_M / ground.gsd_m)),
         reach=max(TIE_HALF_PX, round(_ROOF_REACH_M / ground.gsd_m)),
-    )
+    )  # fmt: skip
     found = clear_matches(found, _ROOF_RATIO)
     return found, height[found.point]
 
@@ -295,15 +243,9 @@ def add_links(flight: FlightBlock, gsd_m: float) -> int:
         return 0
     seen, chosen = linkable_points(flight, LINK_CELL_M)
     camera, point, uv = link_legs(
-        adj.cameras,
-        adj.points,
-        chosen,
-        camera=seen.camera,
-        leg=flight.leg,
-        candidates=candidates,
-        gray=flight.pictures.gray,
-        gsd_m=gsd_m,
-    )
+        adj.cameras, adj.points, chosen, camera=seen.camera, leg=flight.leg, candidates=candidates,
+        gray=flight.pictures.gray, gsd_m=gsd_m,
+    )  # fmt: skip
     if len(camera):  # its unknowns keep their values
         tracks = adj.tracks.with_more(camera, point, uv, _LINK_SIGMA_PX)
         flight.adjustment = Adjustment.begin(adj.cameras, tracks, adj.priors, adj.points, adj.free)
@@ -314,22 +256,8 @@ def add_links(flight: FlightBlock, gsd_m: float) -> int:
 def linkable_points(flight: FlightBlock, cell_m: float, pictures: Flags | None = None) -> tuple[BestViews, Indices]:
     """Best views of a flight's points in its pictures, or in some (N,), and one sure point a leg in each cell."""
     seen = flight.best_views(pictures)
-    usable = (seen.camera >= 0) & (seen.count >= _LINK_VIEWS) & (seen.mean_weight > _LINK_VIEW_WEIGHT)
-    leg = flight.leg[np.maximum(seen.camera, 0)]
-    cost = np.where(usable, -seen.count.astype(float), np.inf)
-    return seen, one_per_cell(flight.adjustment.points, leg, cost, cell_m)
-
-
-def first_ties(flight: FlightBlock, surface: GroundModel, ground: LoadedMap) -> MapMatches:
-    """Tie points of a flight that the coarse registration put on the map within some metres."""
-    cell_m = _FIRST_TIE_CELL_SPARSE_M if flight.sparse else _FIRST_TIE_CELL_M
-    return clear_matches(tie_matches(flight, surface, ground, cell_m=cell_m, reach_m=FIRST_TIE_REACH_M))
-
-
-def small_ties(flight: FlightBlock, surface: GroundModel, ground: LoadedMap, half_m: float) -> MapMatches:
-    """Matches of small patches that touch each other: more evidence where few large ones fit, too noisy as ties."""
-    cell_m, reach_m = 2.0 * half_m, FIRST_TIE_REACH_M
-    return clear_matches(tie_matches(flight, surface, ground, cell_m=cell_m, reach_m=reach_m, half_m=half_m))
+    usable = (seen.count >= _LINK_VIEWS) & (seen.mean_weight > _LINK_VIEW_WEIGHT)
+    return seen, flight.one_per_cell(seen, usable, -seen.count, cell_m)
 
 
 def orient_on_map(
@@ -362,8 +290,7 @@ def reorient_on_map(
 
 def _step(flight: FlightBlock, surface: GroundModel, ties: MapTies, tie_scale: float) -> None:
     """One Gauss-Newton step with tie points, heights held near the ground."""
-    prior = surface.height_prior(flight.adjustment.points)
-    flight.adjustment.step(TRACK_ROBUST_C, prior, ties, tie_scale)
+    flight.adjustment.step(TRACK_ROBUST_C, surface.height_prior(flight.adjustment.points), ties, tie_scale)
 
 
 def _second_round(
@@ -371,14 +298,15 @@ def _second_round(
 ) -> tuple[GroundModel, MapTies, MapMatches]:
     """New tie points, compared on the ground as the caller has just fitted it, and steps with them."""
     cell_m = _TIE_CELL_SPARSE_M if flight.sparse else _TIE_CELL_M
-    found = tie_matches(flight, surface, ground, cell_m=cell_m, reach_m=TIE_REACH_M, pictures=pictures)
-    matches = clear_matches(found)
+    matches = tie_matches(flight, surface, ground, cell_m=cell_m, reach_m=TIE_REACH_M, pictures=pictures)
     matches = replace(matches, shift=matches.shift - edge_displacement(flight, surface, ground, matches))
     ties = as_ties(matches, flight.adjustment.points)
     for k in range(rounds):
         _step(flight, surface, ties, TIE_SCALES[min(k, 1)])
-        if k in (0, 1):
-            ties = with_sigma_of_residuals(ties, flight.adjustment.tie_residual)
+        residual = flight.adjustment.tie_residual
+        if k in (0, 1) and len(residual) >= _TIE_FEWEST_FOR_SIGMA:  # decimetres on new maps, a metre on old ones
+            sigma = float(np.clip(mad_sigma(residual), *_TIE_SIGMA_LIMITS_M))
+            ties = replace(ties, sigma_m=np.full(len(ties.point), sigma))
         if k == rounds - 2:
             surface = refit_ground(flight, surface, as_smooth=True)
     return surface, ties, matches
@@ -421,15 +349,17 @@ def confirmed(
     """The first registration that tie points confirm; the cameras then lie there, else where they were."""
     before = flight.adjustment.copy()
     limit, tests = np.log10(FALSE_MATCHES), 0
+    cell_m = _FIRST_TIE_CELL_SPARSE_M if flight.sparse else _FIRST_TIE_CELL_M
     for fit in fits:
         shift_cameras(flight, fit.correction)
         ground = load_map(flight, basemap, origin, map_gsd(flight, basemap))
-        matches = first_ties(flight, surface, ground)
+        matches = tie_matches(flight, surface, ground, cell_m=cell_m, reach_m=FIRST_TIE_REACH_M)
         tests += 1  # each test is one more chance to agree
         chance = evidence_log10(flight, matches, tie_half_m(flight)) + np.log10(tests)
-        if chance > limit:  # a few photos have room for a few patches of this size only: more and smaller ones
+        if chance > limit:  # few photos have room for few such patches: more and smaller ones, too noisy as ties
             half_m, tests = _EVIDENCE_SMALL_HALF_M, tests + 1
-            chance = evidence_log10(flight, small_ties(flight, surface, ground, half_m), half_m) + np.log10(tests)
+            small = tie_matches(flight, surface, ground, cell_m=2.0 * half_m, reach_m=FIRST_TIE_REACH_M, half_m=half_m)
+            chance = evidence_log10(flight, small, half_m) + np.log10(tests)
         if chance <= limit:
             return ConfirmedFit(fit, ground, matches, float(10.0**chance))
         flight.adjustment = before.copy()

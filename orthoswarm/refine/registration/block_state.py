@@ -53,25 +53,22 @@ class WorkArea:
 
 @dataclass(slots=True, kw_only=True)
 class VehicleState:
-    """One vehicle between passes. It can be pickled; decoded pictures are not part of it.
+    """One vehicle between passes; it can be pickled, without its decoded pictures.
 
     Attributes:
-        vehicle: id. flight: frames, records, adjustment. coarse: cameras before the map was used, coarse_surface: the
-            ground below them in the same frame.
-        surface: its ground. ties, matches: of the last round (empty without a map).
-        roofs: raised points on the map and their heights.
-        unfound: True where there is a map and learned matching is still to be tried.
-        map_shift: float64 (N, 2) or (2,), what the coarse registration added to the coarse cameras.
+        coarse: cameras before the map was used; coarse_surface: the ground below them, in the same frame.
+        surface: its ground. ties, matches: of the last round (empty without a map). roofs: raised points on the map and
+            their heights. map_shift: float64 (N, 2) or (2,), what the coarse registration added to the coarse cameras.
         dense: extra ground points (K, 3) and sigmas (K,). high: points (H, 3) on what stands high above the ground.
-        on_map: True if it was found on the map; had_map: if there was one; carried: if it was not, but neighbours that
-            were carry it. joined: if no map holds it, but it was registered to neighbours that none holds either.
+        had_map: whether there is a map. on_map: whether it was found there; unfound: learned matching is still to be
+            tried. carried: neighbours that were found carry it. joined: no map holds it, but neighbours alike do.
         coarse_shift: how its block was shifted onto a map of far coarser pixels, None if it was not.
-        datum_sigma_m: float64 (N,) of the place of a block that no map holds, by all its receivers; None for one alone.
+        sigma_m: float64 (N,) own error estimates, coarse_sigma_m before the map. receiver_sigma_m: float64 (2,) of its
+            place by its receiver alone, east and north. datum_sigma_m: float64 (N,) of the place of a block that no map
+            holds, by all its receivers; None for one alone.
         false_matches: expected number of agreements with a map of other ground as good as the one that put it there.
         map_distortion_m2: variance of an axis of the map's own local distortion as its ties show it, as far as it is
             more than the error that all ties have in common; NaN without ties.
-        sigma_m: float64 (N,) own error estimates, coarse_sigma_m before the map. receiver_sigma_m: float64 (2,) of its
-            place by its receiver alone, east and north.
         pose_covariance: float32 (N, 6, 6) of the adjusted cameras, see bundle.covariance.StatedErrors.
         fov_sigma_deg: of the field of view. timings: stage -> CPU seconds.
     """
@@ -112,12 +109,12 @@ def lies_on_map(state: VehicleState) -> bool:
 
 def findings(state: VehicleState) -> list[str]:
     """Warnings about a vehicle: findings of its records, and how it was registered."""
+    shift = state.coarse_shift
     if state.carried:
         return [*state.flight.warnings, CARRIED]
-    if state.coarse_shift is not None:
-        shift = state.coarse_shift
+    if shift is not None:
         return [*state.flight.warnings, SHIFTED.format(gsd_m=shift.gsd_m, sigma_m=shift.sigma_m)]
-    return [*state.flight.warnings, NOT_FOUND] if state.had_map and not state.on_map else list(state.flight.warnings)
+    return [*state.flight.warnings, *([NOT_FOUND] if state.had_map and not state.on_map else [])]
 
 
 class Stopwatch:
@@ -140,14 +137,9 @@ class Stopwatch:
 
 
 def to_solution(
-    state: VehicleState,
-    origin: Array,
-    terrain: Terrain | None,
-    *,
-    coarse: bool = False,
-    map_lean: tuple[float, float] = (0.0, 0.0),
-    ground_z_m: float = 0.0,
-) -> Solution:
+    state: VehicleState, origin: Array, terrain: Terrain | None, *, coarse: bool = False,
+    map_lean: tuple[float, float] = (0.0, 0.0), ground_z_m: float = 0.0,
+) -> Solution:  # fmt: skip
     """The state as a Solution on the area's grid (full-resolution lenses); coarse takes the cameras before the map."""
     flight = state.flight
     cameras = full_resolution(state.coarse if coarse else flight.adjustment.cameras, flight)
@@ -157,24 +149,21 @@ def to_solution(
     weak = weakly_held(flight)
     placed = [
         PlacedFrame(
-            frame,
-            cameras.camera(i, origin),
-            stage,
-            float(sigma[i]),
-            bool(weak[i]),
+            frame, cameras.camera(i, origin), stage, float(sigma[i]), bool(weak[i]),
             pose_covariance=None if covariance is None else covariance[i],
         )
         for i, frame in enumerate(flight.frames)
         if i not in flight.pictures.damaged
-    ]
-    dropped = {flight.frames[i].image: reason for i, reason in flight.pictures.damaged.items()}
-    fov = fov_rad(flight.focal_px, flight.pictures.size[0])
+    ]  # fmt: skip
+    points, _ = ground_points(flight.adjustment)
+    heights = flight.cameras().position[:, 2]  # of one state with the points, also where `cameras` are those before
+    above_m = heights.mean() - points[:, 2].mean() if len(points) else np.nan
     return Solution(
         vehicle=state.vehicle,
         placed=placed,
-        dropped=dropped,
+        dropped={flight.frames[i].image: reason for i, reason in flight.pictures.damaged.items()},
         legs=leg_states(state),
-        fov_deg=float(np.degrees(fov)),
+        fov_deg=float(np.degrees(fov_rad(flight.focal_px, flight.pictures.size[0]))),
         fov_sigma_deg=state.fov_sigma_deg,
         terrain=terrain,
         ground_z_m=ground_z_m,
@@ -182,18 +171,9 @@ def to_solution(
         state=state,
         warnings=findings(state),
         timings=dict(state.timings),
-        gsd_m=_mean_gsd(cameras, flight),
+        gsd_m=float(above_m / cameras.lens[0, F]),
         false_matches=state.false_matches,
     )
-
-
-def _mean_gsd(cameras: CameraBlock, flight: FlightBlock) -> float:
-    """Mean height above the ground's points over the focal length (cameras: full resolution), metres a pixel."""
-    points, _ = ground_points(flight.adjustment)
-    if not len(points):
-        return float("nan")
-    heights = flight.cameras().position[:, 2]  # of one state with the points, also where `cameras` are those before
-    return float((heights.mean() - points[:, 2].mean()) / cameras.lens[0, F])
 
 
 def full_resolution(cameras: CameraBlock, flight: FlightBlock) -> CameraBlock:

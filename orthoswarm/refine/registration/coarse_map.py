@@ -22,12 +22,12 @@ from orthoswarm.refine.registration.map_evidence import FALSE_MATCHES
 from orthoswarm.refine.registration.orientation_correlation import (
     COARSE_REACH_M,
     PEAK_APART_PX,
-    STRIP_BORDER_PX,
     STRIP_FEWEST_EDGES,
     Mosaic,
     OrientationField,
     Search,
     correlation,
+    edges_of,
     highest,
     on_map,
     standing_out,
@@ -139,10 +139,7 @@ def _mosaic(flights: Sequence[FlightBlock], ground_z: float, gsd_m: float) -> Mo
 
 def _texture(grey: Floats, valid: Flags) -> OrientationField:
     """Gradients g m / (|g|^2 + m^2) as complex numbers, 0 where not valid; see `patch_matching.gradients`."""
-    side = STRIP_BORDER_PX
-    gradient = cv2.Sobel(grey, cv2.CV_32F, 1, 0) + 1j * cv2.Sobel(grey, cv2.CV_32F, 0, 1)
-    inner = cv2.erode(valid.astype(np.uint8), np.ones((side, side), np.uint8), borderValue=0).astype(bool)
-    length = np.abs(gradient)
+    gradient, length, inner = edges_of(grey, valid)
     middle = _COARSE_MAP_TEXTURE * float(np.median(length[inner])) if inner.any() else 0.0
     weight = middle / np.maximum(length**2 + middle**2, 1e-6)
     return np.asarray(np.where(inner, gradient * weight, 0), np.complex64)

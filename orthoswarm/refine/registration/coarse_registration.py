@@ -1,7 +1,7 @@
 """Coarse registration of one vehicle: strips correlated with the map, a consensus line, a smooth correction."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
 
@@ -39,10 +39,9 @@ _LEARNED_REACH_M: Final = 30.0  # how far they are searched (for its time)
 class CoarseFit:
     """How a vehicle lies on the map after correlation.
 
-    Attributes:
-        correction: float64 (N, 2), metres to add to each camera. matches: all windows found. inlier: bool for each.
-        confidence: share of the windows that agree. If only the sum of their correlations has a peak: 1 minus the ratio
-            of its second peak to the first.
+    correction: float64 (N, 2), metres to add to each camera. matches: all windows found. inlier: bool for each.
+    confidence: share of the windows that agree. If only the sum of their correlations has a peak: 1 minus the ratio of
+    its second peak to the first.
     """
 
     correction: Array
@@ -79,33 +78,30 @@ def _fit_together(flight: FlightBlock, search: Search) -> CoarseFit | None:
 
 def _fit_within(flight: FlightBlock, search: Search) -> CoarseFit | None:
     """A line of shifts on which most strips agree."""
-    cameras = flight.cameras()
-    found = [register(cameras, index, flight.pictures.small, search) for index in _strips(flight)]
-    matches = [m for m in found if m is not None]
+    found = [register(flight.cameras(), index, flight.pictures.small, search) for index in _strips(flight)]
+    return _agreed(flight, [m for m in found if m is not None])
+
+
+def _agreed(flight: FlightBlock, matches: list[Match]) -> CoarseFit | None:
+    """The line of shifts that most matches agree on; None without a match."""
     if not matches:
         return None
     inlier = _consensus(matches)
-    return CoarseFit(_smooth(matches, inlier, len(cameras)), matches, inlier, float(inlier.mean()))
+    return CoarseFit(_smooth(matches, inlier, len(flight.frames)), matches, inlier, float(inlier.mean()))
 
 
 def learned_fit(flight: FlightBlock, basemap: MapWindow, origin: Array, device: str) -> CoarseFit | None:
     """Registration by learned matching of a few strips, where correlation found no consensus; None without one."""
-    cameras = flight.cameras()
+    cameras, find = flight.cameras(), partial(by_learning, device=device)
     gsd = float(np.clip(picture_width_m(flight) / _LEARNED_ACROSS_PX, *_LEARNED_GSD_M))
     windows = _windows(flight.leg, _LEARNED_PICTURES)
     search = Search(TiledMap(basemap, gsd), origin, _LEARNED_REACH_M, gsd)
-    spread = np.linspace(0, len(windows) - 1, _LEARNED_STRIPS).round().astype(int)
-    chosen = [windows[k] for k in np.unique(spread)]
-    found = [
-        register(cameras, index, flight.pictures.gray, search, partial(by_learning, device=device)) for index in chosen
-    ]
-    matches = [m for m in found if m is not None]
-    if len(matches) < 2:
+    chosen = np.unique(np.linspace(0, len(windows) - 1, _LEARNED_STRIPS).round().astype(int))
+    found = [register(cameras, windows[k], flight.pictures.gray, search, find) for k in chosen]
+    fit = _agreed(flight, [m for m in found if m is not None])
+    if fit is None or fit.inlier.sum() < max(2, len(fit.matches) // 2 + 1):
         return None
-    inlier = _consensus(matches)
-    if inlier.sum() < max(2, len(matches) // 2 + 1):
-        return None
-    return CoarseFit(_smooth(matches, inlier, len(cameras)), matches, inlier, float(inlier.sum()) / len(chosen))
+    return replace(fit, confidence=float(fit.inlier.sum()) / len(chosen))
 
 
 def shift_cameras(flight: FlightBlock, correction: Array) -> None:

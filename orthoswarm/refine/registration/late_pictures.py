@@ -67,10 +67,10 @@ def register_late_pictures(
 
     def small(placed: PlacedFrame) -> Gray:
         if placed.frame.image not in pictures:
-            gray = read(placed.frame)
-            pictures[placed.frame.image] = cv2.resize(
-                gray, working_size(placed.camera.lens), interpolation=cv2.INTER_AREA
-            )
+            lens, gray = placed.camera.lens, read(placed.frame)
+            scale = min(1.0, _WORK_WIDTH_PX / lens.width)
+            size = max(1, round(lens.width * scale)), max(1, round(lens.height * scale))
+            pictures[placed.frame.image] = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
         return pictures[placed.frame.image]
 
     holds = [p for p in refined.placed if not p.weak]
@@ -82,22 +82,11 @@ def register_late_pictures(
         except OrthoSwarmError as error:
             dropped[guess.frame.image] = str(error)
             continue
-        near = _nearest(guess, holds)
-        placed.append(
-            _fitted(guess, [ground_observations(guess, picture, other, small(other), terrain) for other in near], near)
-        )
+        away = [float(np.hypot(*(p.camera.nadir - guess.camera.nadir))) for p in holds]
+        near = [holds[i] for i in np.argsort(away, kind="stable")[:_NEIGHBOURS]]
+        seen = [ground_observations(guess, picture, other, small(other), terrain) for other in near]
+        placed.append(_fitted(guess, seen, near))
     return placed, dropped
-
-
-def working_size(lens: Lens) -> tuple[int, int]:
-    """Columns and rows in which a picture is compared."""
-    scale = min(1.0, _WORK_WIDTH_PX / lens.width)
-    return max(1, round(lens.width * scale)), max(1, round(lens.height * scale))
-
-
-def _nearest(one: PlacedFrame, others: Sequence[PlacedFrame]) -> list[PlacedFrame]:
-    away = [float(np.hypot(*(p.camera.nadir - one.camera.nadir))) for p in others]
-    return [others[i] for i in np.argsort(away, kind="stable")[:_NEIGHBOURS]]
 
 
 def ground_observations(
@@ -110,9 +99,11 @@ def ground_observations(
     """
     z = float(terrain.height(one.camera.nadir))
     mine, its = _reduced(one.camera.lens, gray), _reduced(other.camera.lens, known)
-    here = replace(one.camera, lens=mine).homography(z)
-    there = replace(other.camera, lens=its).homography(z)
-    move = _local(there, one.camera.nadir) @ _local(here, one.camera.nadir, inverse=False)  # my pixels -> its pixels
+    east, north = one.camera.nadir  # about it grid coordinates lose no digits
+    shift = np.array([[1.0, 0.0, -east], [0.0, 1.0, -north], [0.0, 0.0, 1.0]])
+    here = shift @ replace(one.camera, lens=mine).homography(z)
+    there = shift @ replace(other.camera, lens=its).homography(z)
+    move = np.linalg.inv(there) @ here  # my pixels -> its pixels
     rows, cols = gray.shape
     warp = cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR
     turned = cv2.warpPerspective(known, move, (cols, rows), flags=warp)
@@ -142,13 +133,6 @@ def _reduced(lens: Lens, gray: Gray) -> Lens:
     return replace(
         lens, width=cols, height=rows, focal_px=lens.focal_px * scale, cx=lens.cx * scale, cy=lens.cy * scale
     )
-
-
-def _local(homography: Array, origin: Array, *, inverse: bool = True) -> Array:
-    """A homography to the ground (or its inverse) about a ground point, so that grid coordinates lose no digits."""
-    shift = np.array([[1.0, 0.0, -origin[0]], [0.0, 1.0, -origin[1]], [0.0, 0.0, 1.0]])
-    matrix = shift @ homography
-    return np.asarray(np.linalg.inv(matrix) if inverse else matrix)
 
 
 def on_terrain(camera: Camera, uv: Array, terrain: Terrain) -> Array:
@@ -190,8 +174,7 @@ def centre_sigma(camera: Camera, uv: Array, ground: Array, scale: float) -> floa
     moved = [_moved(camera, step) for step in _STEPS]
     size = _STEPS.sum(1)
     jacobian = np.stack([(c.project(ground) - uv) / scale - off for c in moved], -1).reshape(-1, 6) / size
-    prior = _prior()
-    covariance = np.linalg.inv(jacobian.T @ jacobian / noise**2 + prior)
+    covariance = np.linalg.inv(jacobian.T @ jacobian / noise**2 + _PRIOR)
     middle, z = np.array([camera.lens.principal_point]), float(ground[:, 2].mean())
     centre = np.stack([(c.to_ground(middle, z) - camera.to_ground(middle, z))[0] for c in moved], -1) / size
     return float(np.sqrt(np.trace(centre @ covariance @ centre.T) / 2))
@@ -200,31 +183,24 @@ def centre_sigma(camera: Camera, uv: Array, ground: Array, scale: float) -> floa
 def resected(camera: Camera, uv: Array, ground: Array) -> Camera:
     """A camera's pose by ground points (M, 3) at pixels (M, 2): robust Gauss-Newton, the camera as a loose prior."""
     scale = max(1.0, camera.lens.width / _WORK_WIDTH_PX)
-    prior = _prior()
-    total = np.zeros(6)
-    now = camera
+    total, now = np.zeros(6), camera
     for c in _SCALES_PX:
         for _ in range(_ROUNDS):
             off = (now.project(ground) - uv) / scale
             off = np.where(np.isfinite(off), off, 1e3)
             weight = robust_weights((off**2).sum(1), c * c)
-            jacobian = np.stack(
-                [(_moved(camera, total + step).project(ground) - uv) / scale - off for step in _STEPS], -1
-            )
-            jacobian = np.nan_to_num(jacobian / _STEPS.sum(1))
-            normal = np.einsum("mki,m,mkj->ij", jacobian, weight, jacobian) + prior
-            right = np.einsum("mki,m,mk->i", jacobian, weight, off) + prior @ total
+            moved = [(_moved(camera, total + step).project(ground) - uv) / scale - off for step in _STEPS]
+            jacobian = np.nan_to_num(np.stack(moved, -1) / _STEPS.sum(1))
+            normal = np.einsum("mki,m,mkj->ij", jacobian, weight, jacobian) + _PRIOR
+            right = np.einsum("mki,m,mk->i", jacobian, weight, off) + _PRIOR @ total
             total = total - np.linalg.solve(normal, right)
             now = _moved(camera, total)
     return now
 
 
-def _prior() -> Array:
-    """Weights (6, 6) of the start's position and attitude: loose, for what points do not determine."""
-    return np.diag(1.0 / np.array([_POSITION_SIGMA_M] * 3 + [_ATTITUDE_SIGMA_RAD] * 3) ** 2)
-
-
 _STEPS = np.diag([1e-3] * 3 + [1e-5] * 3)
+_PRIOR = np.diag(1.0 / np.array([_POSITION_SIGMA_M] * 3 + [_ATTITUDE_SIGMA_RAD] * 3) ** 2)
+"""Weights (6, 6) of the start's position and attitude: loose, for what points do not determine."""
 
 
 def _moved(camera: Camera, change: Array) -> Camera:

@@ -9,7 +9,6 @@ expected number of false matches. Ties that share ground are not independent; on
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import bdtrc
 
 from orthoswarm.model.arrays import Array, Ints
@@ -30,18 +29,18 @@ def false_matches_log10(
     What is tried: one shift for all of them, and for each leg a line of shifts along it (drift of the receiver, error
     of heading), within each of the tolerances of the configuration.
 
-    Args:
-        ground: float64 (Q, 2), where the ties are, metres.
-        shift: float64 (Q, 2), from there to where the map shows them, metres, before anything was fitted to them.
-        order: float64 (Q,), number of the picture. leg: int32 (Q,), its leg, -1 between legs.
-        reach_m: how far each was searched, to each side. patch_m: side of what was compared.
+    ground: float64 (Q, 2), where the ties are, metres. shift: float64 (Q, 2), from there to where the map shows them,
+    before anything was fitted to them. order: float64 (Q,), number of the picture. leg: int32 (Q,), its leg, -1 between
+    legs. reach_m: how far each was searched, to each side. patch_m: side of what was compared.
     """
-    alone = _one_a_patch(ground, patch_m)
+    # the first tie of each cell of a patch's size
+    cells = np.floor(ground / patch_m).astype(np.int64)
+    alone = np.sort(np.unique(cells, axis=0, return_index=True)[1]) if len(ground) else np.zeros(0, np.intp)
     shift, order, leg = shift[alone], order[alone], leg[alone]
     groups = [(shift, np.zeros(len(shift)))]
     groups += [(shift[leg == k], order[leg == k]) for k in np.unique(leg[leg >= 0])]
     groups = [g for g in groups if len(g[0]) >= _EVIDENCE_FEWEST]
-    best = min((_group(s, t, reach_m, _EVIDENCE_TOLERANCES_M) for s, t in groups), default=0.0)
+    best = min((_group(s, t, reach_m) for s, t in groups), default=0.0)
     return best + float(np.log10(max(len(groups), 1)))
 
 
@@ -50,7 +49,7 @@ def agreement_probability(agree: int, count: int, within_m: float, reach_m: floa
     return _binomial_tail(agree, count, _share(within_m, reach_m))
 
 
-def _group(shift: Array, along: Array, reach_m: float, tolerances: tuple[float, ...]) -> float:
+def _group(shift: Array, along: Array, reach_m: float) -> float:
     """The evidence of one group by its best line through two ties, or by one tie's shift if all are at one place."""
     count = len(shift)
     if np.ptp(along) > 0:
@@ -68,10 +67,10 @@ def _group(shift: Array, along: Array, reach_m: float, tolerances: tuple[float, 
     model = shift[i][:, None] + slope[:, None] * (along[None] - along[i][:, None])[..., None]
     away = np.hypot(*np.moveaxis(shift[None] - model, -1, 0))
     best = 0.0
-    for tolerance in tolerances:
+    for tolerance in _EVIDENCE_TOLERANCES_M:
         most = int((away < tolerance).sum(1).max())
         tail = _binomial_tail(most - fixed, count - fixed, _share(tolerance, reach_m))
-        best = min(best, float(np.log10(tail)) + float(np.log10(len(i) * len(tolerances))))
+        best = min(best, float(np.log10(tail)) + float(np.log10(len(i) * len(_EVIDENCE_TOLERANCES_M))))
     return best
 
 
@@ -86,9 +85,3 @@ def _binomial_tail(successes: int, trials: int, share: float) -> float:
 def _share(within_m: float, reach_m: float) -> float:
     """Share of a square search window that lies within a distance of one place."""
     return min(1.0, np.pi * within_m**2 / (2.0 * reach_m) ** 2)
-
-
-def _one_a_patch(ground: Array, patch_m: float) -> NDArray[np.intp]:
-    """The first tie of each cell of a patch's size."""
-    cells = np.floor(ground / patch_m).astype(np.int64)
-    return np.sort(np.unique(cells, axis=0, return_index=True)[1]) if len(ground) else np.zeros(0, np.intp)

@@ -110,23 +110,18 @@ def had_corrections(frames: Sequence[Frame]) -> bool:
 
 def measure_map_offset(recorded: Sequence[PlacedFrame], refined: Sequence[PlacedFrame]) -> MapOffset | None:
     """The offset of the map against the receivers, by the frames that were refined on the map; None without any."""
-    on_map = [p for p in refined if p.stage == "fine" and not p.weak]
-    return _measured(recorded, on_map, min((p.sigma_m for p in refined if p.stage == "fine"), default=0.0))
+    on_map = [p for p in refined if p.stage == "fine"]
+    return measure_control_offset(recorded, on_map, min((p.sigma_m for p in on_map), default=0.0))
 
 
 def measure_control_offset(
-    recorded: Sequence[PlacedFrame], placed: Sequence[PlacedFrame], found_sigma_m: float
+    recorded: Sequence[PlacedFrame], refined: Sequence[PlacedFrame], found_sigma_m: float
 ) -> MapOffset | None:
-    """The offset of controlled frames against the receivers, or None; found_sigma_m: of the control's shift."""
-    return _measured(recorded, [p for p in placed if not p.weak], found_sigma_m)
-
-
-def _measured(recorded: Sequence[PlacedFrame], refined: Sequence[PlacedFrame], found_m: float) -> MapOffset | None:
-    """Frames against their records; `found_m`: how well the place of the frames itself is known, metres."""
+    """The offset of well placed frames against their receivers, or None; found_sigma_m: of the frames' common place."""
     before = {(p.frame.vehicle, p.frame.image): p.camera.nadir for p in recorded if p.frame.has_own_position}
     moved: dict[str, list[Array]] = {}
     stated: dict[str, list[float]] = {}
-    for p in refined:
+    for p in (p for p in refined if not p.weak):
         was = before.get((p.frame.vehicle, p.frame.image))
         if was is not None:
             moved.setdefault(p.frame.vehicle, []).append(p.camera.nadir - was)
@@ -138,21 +133,17 @@ def _measured(recorded: Sequence[PlacedFrame], refined: Sequence[PlacedFrame], f
     used = sorted(corrected or moved)
     means, sigmas = [], []
     for vehicle in used:
-        mean, spread = _mean(np.array(moved[vehicle]))
-        means.append(mean)
+        vectors = np.array(moved[vehicle])
+        away = np.hypot(*(vectors - np.median(vectors, axis=0)).T)
+        inliers = vectors[away <= _OFFSET_OUTLIER * max(float(np.median(away)), 1e-6)]
+        means.append(inliers.mean(axis=0))
+        spread = float(np.sqrt(inliers.var(axis=0).mean()))
         own = max(accuracy[vehicle], _CORRECTED_FLOOR_M) if corrected else RECEIVER_BIAS_SIGMA_M
         sigmas.append(np.hypot(own, spread))
     offset, sigma = _together(np.array(means), np.array(sigmas))
     common = 0.0 if corrected else RECEIVER_COMMON_SIGMA_M
-    sigma = float(np.linalg.norm([sigma, common, found_m]))
+    sigma = float(np.linalg.norm([sigma, common, found_sigma_m]))
     return MapOffset(float(offset[0]), float(offset[1]), sigma, len(used), bool(corrected))
-
-
-def _mean(moved: Array) -> tuple[Array, float]:
-    """Mean of a vehicle's differences (n, 2) without gross errors, and their spread, an axis."""
-    away = np.hypot(*(moved - np.median(moved, axis=0)).T)
-    inliers = moved[away <= _OFFSET_OUTLIER * max(float(np.median(away)), 1e-6)]
-    return np.asarray(inliers.mean(axis=0)), float(np.sqrt(inliers.var(axis=0).mean()))
 
 
 def _together(means: Array, sigmas: Array) -> tuple[Array, float]:

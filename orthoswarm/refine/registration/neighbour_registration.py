@@ -85,14 +85,9 @@ def fixed_cameras_near(state: VehicleState, others: Sequence[VehicleState]) -> F
 
 
 def link_to_fixed(
-    flight: FlightBlock,
-    fixed: FixedCameras,
-    gsd_m: float,
-    *,
-    reach_px: int = LINK_REACH_PX,
-    pictures: Flags | None = None,
-    cell_m: float | None = None,
-) -> int:
+    flight: FlightBlock, fixed: FixedCameras, gsd_m: float, *, reach_px: int = LINK_REACH_PX,
+    pictures: Flags | None = None, cell_m: float | None = None,
+) -> int:  # fmt: skip
     """Observe own points in fixed pictures and add these observations; the fixed cameras are appended to the block.
 
     gsd_m: pixel in which they are compared. reach_px: how far a point is searched there. pictures: bool (N,), own ones
@@ -109,17 +104,9 @@ def link_to_fixed(
         return flight.pictures.gray(i) if i < n else fixed.gray(i - n)
 
     camera, point, uv = link_legs(
-        joint,
-        adj.points,
-        chosen,
-        camera=seen.camera,
-        leg=leg,
-        candidates=candidates,
-        gray=gray,
-        gsd_m=gsd_m,
-        most=_NEIGHBOUR_PICTURES,
-        reach=reach_px,
-    )
+        joint, adj.points, chosen, camera=seen.camera, leg=leg, candidates=candidates, gray=gray, gsd_m=gsd_m,
+        most=_NEIGHBOUR_PICTURES, reach=reach_px,
+    )  # fmt: skip
     if not len(camera):
         return 0
     tracks = adj.tracks.with_more(camera, point, uv, _NEIGHBOUR_SIGMA_PX)

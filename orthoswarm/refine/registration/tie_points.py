@@ -125,18 +125,9 @@ class MapMatches:
 
 
 def match_points(
-    cameras: CameraBlock,
-    points: Array,
-    chosen: NDArray[np.integer],
-    *,
-    camera: Ints,
-    gray: Callable[[int], Gray],
-    ground: LoadedMap,
-    half: int,
-    reach: int,
-    level: Array | None = None,
-    texture: bool = False,
-) -> MapMatches:
+    cameras: CameraBlock, points: Array, chosen: NDArray[np.integer], *, camera: Ints, gray: Callable[[int], Gray],
+    ground: LoadedMap, half: int, reach: int, level: Array | None = None, texture: bool = False,
+) -> MapMatches:  # fmt: skip
     """Find the surroundings of points on the map.
 
     What surrounds a corner is mostly ground, although the corner itself sits on something raised: so the surroundings
@@ -190,39 +181,26 @@ def vote_lean(matches: MapMatches, height: Array, offset: Array) -> tuple[float,
     slope = shift / height[:, None]
     sigma = _LEAN_SIGMA_M + _LEAN_SIGMA_SHARE * height
 
-    def support(lean: Array) -> tuple[float, Array]:
-        e2 = ((shift - lean * height[:, None]) ** 2).sum(1) / sigma**2
-        w = robust_weights(e2, _LEAN_SCALE)
-        return float(w.sum()), w
+    def weights(lean: Array) -> Array:
+        return robust_weights(((shift - lean * height[:, None]) ** 2).sum(1) / sigma**2, _LEAN_SCALE)
 
     candidates = slope[np.hypot(*slope.T) < _LEAN_MOST]
     if not len(candidates):
         return None
-    best = candidates[int(np.argmax([support(c)[0] for c in candidates]))]
+    best = candidates[int(np.argmax([weights(c).sum() for c in candidates]))]
     for _ in range(8):
-        w = support(best)[1] / sigma**2
+        w = weights(best) / sigma**2
         best = (shift * (w * height)[:, None]).sum(0) / max(float((w * height**2).sum()), 1e-9)
-    total, w = support(best)
-    zero = support(np.zeros(2))[0]
-    least = max(_LEAN_FEWEST, _LEAN_OVER_NONE * zero, _LEAN_LEAST_SHARE * len(height))
-    if total < least:
-        return None
-    return float(best[0]), float(best[1])
+    without = float(weights(np.zeros(2)).sum())
+    least = max(_LEAN_FEWEST, _LEAN_OVER_NONE * without, _LEAN_LEAST_SHARE * len(height))
+    return (float(best[0]), float(best[1])) if weights(best).sum() >= least else None
 
 
 def link_legs(
-    cameras: CameraBlock,
-    points: Array,
-    chosen: NDArray[np.integer],
-    *,
-    camera: Ints,
-    leg: Ints,
-    candidates: NDArray[np.integer],
-    gray: Callable[[int], Gray],
-    gsd_m: float,
-    most: int | None = None,
+    cameras: CameraBlock, points: Array, chosen: NDArray[np.integer], *, camera: Ints, leg: Ints,
+    candidates: NDArray[np.integer], gray: Callable[[int], Gray], gsd_m: float, most: int | None = None,
     reach: int = LINK_REACH_PX,
-) -> tuple[Ints, Ints, Array]:
+) -> tuple[Ints, Ints, Array]:  # fmt: skip
     """Find points of one leg in the pictures of other legs: camera (K,), point (K,), pixel (K, 2) of new observations.
 
     camera: (P,) reference picture of each point. leg: (N,) of each camera. candidates: cameras that may be linked.

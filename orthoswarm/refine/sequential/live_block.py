@@ -21,16 +21,7 @@ from orthoswarm.model.placement import STATED_SIGMA_FACTOR, MapWindow, PlacedFra
 from orthoswarm.model.robust import mad_sigmas
 from orthoswarm.raster.map_cache import TiledMap
 from orthoswarm.refine.bundle.adjustment import TRACK_ROBUST_C
-from orthoswarm.refine.bundle.block_arrays import (
-    CX,
-    CY,
-    HEIGHT,
-    WIDTH,
-    CameraBlock,
-    F,
-    exp_rotation,
-    log_rotation,
-)
+from orthoswarm.refine.bundle.block_arrays import CX, CY, HEIGHT, WIDTH, CameraBlock, F, exp_rotation, log_rotation
 from orthoswarm.refine.bundle.flight_records import FlightRecords, read_records
 from orthoswarm.refine.bundle.normal_equations import room_of_a_point
 from orthoswarm.refine.features.tracks import FLOW_SIGMA_PX, Tracker, predicted_homography
@@ -197,12 +188,10 @@ class LiveBlock:
     def _predicted(self, records: FlightRecords) -> tuple[Array, Array]:
         """Position and attitude of the next picture: its corrected record, or the flown path where that is far off."""
         position, rotation = self._corrected(records)
-        last = self._views[-2:]
-        if len(last) > 1:
+        if len(self._views) > 1:
+            before, last = (view.position for view in self._views[-2:])
             took = np.diff(records.time_s[-3:])
-            on = last[-1].position + (last[-1].position - last[-2].position) * np.clip(
-                took[1] / max(took[0], 1e-3), 0, 3
-            )
+            on = last + (last - before) * np.clip(took[1] / max(took[0], 1e-3), 0, 3)
             if np.hypot(*(on - position)[:2]) > _LEAP_M:
                 position = on
         return position, rotation
@@ -238,8 +227,8 @@ class LiveBlock:
         view, cameras = self._views[-1], self._cameras()
         fresh = ~np.isin(view.ident, self._ids)
         uv = view.uv[fresh].astype(float)
-        index, z = np.full(len(uv), len(cameras) - 1, np.int32), np.zeros(len(uv))
-        z[:] = self._surface.height(view.position[None, :2])[0]
+        index = np.full(len(uv), len(cameras) - 1, np.int32)
+        z = np.full(len(uv), self._surface.height(view.position[None, :2])[0])
         for _ in range(2):
             xy = cameras.to_ground(index, uv, z)
             z = self._surface.height(np.nan_to_num(xy))
@@ -267,17 +256,13 @@ class LiveBlock:
         heights, cameras = self._surface.height_prior(self._points), self._cameras()
         weight = np.zeros(len(uv))
         solved = adjust_window(
-            cameras.arrays,
-            self._points,
+            cameras.arrays, self._points,
             (np.searchsorted(point, np.arange(count + 1)), camera, uv, np.full(len(uv), FLOW_SIGMA_PX**-2.0)),
-            np.arange(len(views), dtype=np.int32),
-            np.array(scales),
+            np.arange(len(views), dtype=np.int32), np.array(scales),
             (heights.height, 1.0 / heights.sigma**2, heights.c, 1.0 / heights.soft_sigma**2),
             (tie_of_point, self._tie_xy, np.full(ties, TIE_SIGMA_M**-2.0), TIE_SCALES[-1]),
-            self._priors(),
-            room_of_a_point(),
-            (weight, np.zeros((ties, 2)), self._covariance),
-        )
+            self._priors(), room_of_a_point(), (weight, np.zeros((ties, 2)), self._covariance),
+        )  # fmt: skip
         if not solved or not np.isfinite(cameras.position).all():
             raise AdjustmentError("the newest pictures do not hold together")
         for i, view in enumerate(views):
@@ -317,21 +302,13 @@ class LiveBlock:
         if not len(at):
             return 0
         at = at[spread_points(self._points[at, :2], _TIES)]
-        camera = np.full(len(self._ids), len(self._views) - 1, np.int32)
         found = clear_matches(
             match_points(
-                self._cameras(),
-                self._points,
-                at,
-                camera=camera,
-                gray=lambda _: gray,
-                ground=ground,
-                half=max(TIE_HALF_PX, round(self._half_m / ground.gsd_m)),
-                reach=max(TIE_REACH_PX, round(TIE_REACH_M / ground.gsd_m)),
-                level=level,
-                texture=True,
+                self._cameras(), self._points, at, camera=np.full(len(self._ids), len(self._views) - 1, np.int32),
+                gray=lambda _: gray, ground=ground, half=max(TIE_HALF_PX, round(self._half_m / ground.gsd_m)),
+                reach=max(TIE_REACH_PX, round(TIE_REACH_M / ground.gsd_m)), level=level, texture=True,
             )
-        )
+        )  # fmt: skip
         self._tried = np.concatenate([self._tried, self._ids[at]])
         self._tie_ids = np.concatenate([self._tie_ids, self._ids[found.point]])
         self._tie_xy = np.concatenate([self._tie_xy, self._points[found.point, :2] + found.shift])

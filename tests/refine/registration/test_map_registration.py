@@ -12,7 +12,7 @@ from orthoswarm.model.camera import rotation_from_angles
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.refine.bundle.block_arrays import CameraBlock
 from orthoswarm.refine.features.patch_matching import gradients, locate, template_of, window_of
-from orthoswarm.refine.flight.relative_block import one_per_cell
+from orthoswarm.refine.flight.relative_block import BestViews, FlightBlock
 from orthoswarm.refine.registration.absolute_orientation import (
     clear_matches,
     edge_displacement,
@@ -389,6 +389,8 @@ def test_the_agreed_shift_outvotes_a_scattered_majority():
 
 def test_each_cell_of_each_leg_gives_its_best_point():
     points = np.array([[1.0, 1, 0], [2, 2, 0], [3, 3, 0], [55, 1, 0]])
-    leg = np.array([0, 0, 1, 0], np.int32)
-    chosen = one_per_cell(points, leg, np.array([0.5, 0.2, 0.9, np.inf]), 50.0)
+    flight = SimpleNamespace(adjustment=SimpleNamespace(points=points), leg=np.array([0, 0, 1, 0], np.int32))
+    seen = BestViews(np.arange(4, dtype=np.int32), np.ones(4, np.int32), np.ones(4))
+    usable = np.array([True, True, True, False])
+    chosen = FlightBlock.one_per_cell(flight, seen, usable, np.array([0.5, 0.2, 0.9, 0.1]), 50.0)
     np.testing.assert_array_equal(chosen, [1, 2])
