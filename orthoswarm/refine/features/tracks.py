@@ -244,7 +244,6 @@ def _gate(guess: Floats, found: Floats, ok: Flags, shape: tuple[int, ...]) -> tu
         if np.hypot(*middle) <= _FLOW_MEDIAN_LIMIT_PX:
             ok &= np.hypot(*(residual - middle).T) < _FLOW_GATE_PX
             kept = int(ok.sum())
-    chance = _FLOW_CHANCE_SHARE
     if kept <= chance * expected + 3.0 * np.sqrt(chance * (1.0 - chance) * expected):
         ok[:], kept = False, 0
     return kept, expected
