@@ -75,9 +75,7 @@ def write_cog(
     """
     row0, row1, col0, col1 = window or (0, source.grid.height, 0, source.grid.width)
     row1, col1 = max(row1, row0 + 1), max(col1, col0 + 1)
-    levels = [_Level(1, row1 - row0, col1 - col0)]
-    while max(levels[-1].rows, levels[-1].cols) > TILE_PX:
-        levels.append(_Level(2 * levels[-1].factor, row1 - row0, col1 - col0))
+    levels = _levels(row1 - row0, col1 - col0)
     with atomic_write(path) as part, part.open("w+b") as file:
         tables = _write_directories(
             file, source.grid, (row0, col0), levels=levels, form=_form_of(levels, classic_bytes), time_s=time_s
@@ -103,6 +101,13 @@ class _Level:
         self.rows, self.cols = -(-rows // factor), -(-cols // factor)
         self.tile_rows, self.tile_cols = -(-self.rows // TILE_PX), -(-self.cols // TILE_PX)
         self.tiles = self.tile_rows * self.tile_cols
+
+
+def _levels(rows: int, cols: int) -> list[_Level]:
+    levels = [_Level(1, rows, cols)]
+    while max(levels[-1].rows, levels[-1].cols) > TILE_PX:
+        levels.append(_Level(2 * levels[-1].factor, rows, cols))
+    return levels
 
 
 class _Table:
