@@ -46,7 +46,8 @@ _Map = tuple[Sequence[PlacedFrame], Terrain | None]
 
 def refined_pictures(run: RunContext, state: RunState, refinement: Refinement | None) -> list[PlacedFrame]:
     """Draw coarse.tif and orthoimage.tif; returns the frames as last placed."""
-    coarser = _QUICK if run.options.quick else 1.0
+    drawn = any(run.space.recall(name) is not None for name in (COARSE, ORTHOIMAGE))  # in full, by an interrupted run
+    coarser = _QUICK if run.options.quick and not drawn else 1.0
     if refinement is None:
         state.gsd_m *= coarser
         placed = _looking_down(run, state, state.recorded.placed)
@@ -211,10 +212,8 @@ class _DecodedSizes:
         heights = terrain.height(np.array([p.camera.nadir for p in placed]).reshape(-1, 2))
         self._factor = {}
         for p, z in zip(placed, heights.tolist(), strict=True):
-            factor, most = (
-                working_factor(p.frame),
-                reduction(gsd_m, (p.camera.position[2] - z) / p.camera.lens.focal_px),
-            )
+            factor = working_factor(p.frame)
+            most = reduction(gsd_m, (p.camera.position[2] - z) / p.camera.lens.focal_px)
             while factor > most:
                 factor //= 2
             self._factor[p.frame.image] = factor

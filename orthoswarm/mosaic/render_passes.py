@@ -35,9 +35,10 @@ from orthoswarm.mosaic.kernels.render_arrays import Shots
 from orthoswarm.mosaic.seam_labels import label_tile, label_windows, write_labels
 from orthoswarm.mosaic.seams.feather import labels_around, mix, transition
 from orthoswarm.mosaic.seams.leveling import TileColors, TileFactors, tile_colors
-from orthoswarm.mosaic.seams.previews import COLUMNS, ROWS, write_preview
+from orthoswarm.mosaic.seams.previews import write_preview
 from orthoswarm.mosaic.seams.seam_pixels import SeamPixels
 from orthoswarm.mosaic.seams.seam_tiles import SeamCells, seam_labels
+from orthoswarm.raster.grey_pictures import WORK_WIDTH_PX
 from orthoswarm.raster.picture_file import PictureError
 from orthoswarm.raster.picture_parts import Box, Part, PictureParts
 from orthoswarm.stores.local_copies import copy_ahead
@@ -285,7 +286,7 @@ def preview_pass(task: PreviewTask) -> None:
     copy_ahead(path for path, _ in task.pictures)
     for path, row in task.pictures:
         with contextlib.suppress(PictureError):
-            write_preview(task.previews, row, task.read(path, max(ROWS, COLUMNS)))
+            write_preview(task.previews, row, task.read(path, WORK_WIDTH_PX))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -354,6 +355,7 @@ class _Ground:
 
     def __init__(self, layer: TaskLayer) -> None:
         self.layer, self.store = layer, layer.place.store()
+        self.near: dict[Key, SeamPixels] = {}
         self.lattices = {key: layer.place.heights(key, terrain) for key, terrain in layer.terrain.items()}
         self.about = {key: layer.shots.about(*layer.place.corner(key)) for key in layer.terrain}
 
@@ -369,8 +371,9 @@ class _Ground:
             camera = position[shot.row], rotation[shot.row], layer.shots.lens[shot.row]
             ground = self.lattices[w.key], layer.place.grid.gsd_m
             if w.is_listed:
-                near = SeamPixels.open(layer.place.seam_file(w.key))
+                near = self.near.get(w.key) or SeamPixels.open(layer.place.seam_file(w.key))
                 assert near is not None
+                self.near[w.key] = near
                 some = near.of(shot.index + 1)
                 target = near.colors[:, some]
                 found = place_listed(near.index[some], layer.place.tile_px, *camera, *ground, size, factor)

@@ -48,7 +48,7 @@ class GreyPictures:
 
     def rgb(self, path: Path, longest: int) -> Bytes:
         """See `read_rgb`; not smaller than the working size, and the grey values of one of that size are stored."""
-        picture = read_rgb(path, longest)
+        picture = read_rgb(path, max(longest, WORK_WIDTH_PX))
         height, width = picture.shape[:2]
         if reduction(width, height, WORK_WIDTH_PX) == 1 and path not in records(self.folder):
             self._store(path, _luma(picture))
