@@ -133,11 +133,11 @@ class Served:
         """
         before, end = None, 0.0
         while True:
-            answer = self.get(path)
+            answer = self.get(path, headers=self.auth)
             value = answer.json()
             if (answer.is_success or path == "/healthz") and done(value):
                 return value
-            if (now := (value, self.get("/api/jobs").json())) != before:
+            if (now := (value, self.get("/api/jobs", headers=self.auth).json())) != before:
                 before, end = now, time.monotonic() + limit_s
             if time.monotonic() > end:
                 raise AssertionError(f"{path} is still {now[0]}; jobs {now[1]}")
