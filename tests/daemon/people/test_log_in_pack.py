@@ -14,7 +14,7 @@ def test_the_pack_has_the_log(tmp_path):
     with serving(tmp_path / "post", "--lan", "--bind", "127.0.0.1") as served:
         for shot in line(6):
             assert served.post("/api/frames", headers=served.auth, **form(shot)).status_code == 201
-        served.until("/api/frames", lambda rows: len(rows) == 6 and all(row["drawn"] for row in rows))
+        served.until("/api/frames", lambda rows: len(rows) == 6 and all(row["on_map"] for row in rows))
         find = {"lat_deg": 48.0, "lon_deg": 11.0, "note": "boat"}
         assert served.post("/api/finds", json=find, headers=served.auth).status_code == 201
         job = served.command("/api/export", {"formats": ["pack"]}).json()["id"]
