@@ -52,7 +52,7 @@ class MissionItem:
         command: MAV_CMD. frame: MAV_FRAME of x, y, z.
         params: param1 to param4, NaN where the command leaves the choice to the vehicle.
         x, y: latitude and longitude in 1e-7 degrees for a command with a place, else param5 and param6.
-        z: altitude in metres of the frame, else param7.
+        z: altitude in metres of the frame, else param7. autocontinue: go on to the next item by itself.
     """
 
     command: int
@@ -155,6 +155,7 @@ class Mission:
     """A mission for one vehicle, or its geofence, item by item as it goes on the wire.
 
     Attributes:
+        autopilot: whose dialect it is in.
         items: all items; for ArduPilot item 0 of a mission is home (the vehicle overwrites it), for PX4 it is flown.
         name: for messages to the user. list_type: MAV_MISSION_TYPE, of a mission or of a geofence.
     """

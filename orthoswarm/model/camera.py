@@ -62,17 +62,27 @@ class Lens:
     """A pinhole with OpenCV's radial distortion about the picture's centre.
 
     x_d = x_u (1 + k1 r2 + k2 r2^2 + k3 r2^3) with x in units of f about ((W-1)/2 + cx, (H-1)/2 + cy).
+
+    Attributes:
+        width: columns of the picture.
+        height: rows.
+        focal_px: focal length in pixels of the undistorted pinhole.
+        k1: first radial term.
+        k2: second.
+        k3: third.
+        cx: offset of the principal point from the centre in pixels, columns.
+        cy: rows.
     """
 
-    width: int  # columns of the picture
-    height: int  # rows
-    focal_px: float  # focal length in pixels of the undistorted pinhole
+    width: int
+    height: int
+    focal_px: float
     _: KW_ONLY
-    k1: float = 0.0  # first radial term
-    k2: float = 0.0  # second
-    k3: float = 0.0  # third
-    cx: float = 0.0  # offset of the principal point from the centre in pixels, columns
-    cy: float = 0.0  # rows
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    cx: float = 0.0
+    cy: float = 0.0
 
     @property
     def fov_rad(self) -> float:
@@ -144,11 +154,18 @@ def ground_jacobian(rotation: Array, height_m: float, least_down: float) -> Arra
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """Exterior and interior orientation of a picture."""
+    """Exterior and interior orientation of a picture.
 
-    position: Array  # float64 (3,), easting, northing, height in metres (heights share the datum of the ground plane)
-    rotation: Array  # float64 (3, 3), camera to ground; columns are the camera's axes in east, north, up
-    lens: Lens  # its lens
+    Attributes:
+        position: float64 (3,), easting, northing, height in metres (heights share the datum of the ground
+            plane).
+        rotation: float64 (3, 3), camera to ground; columns are the camera's axes in east, north, up.
+        lens: its lens.
+    """
+
+    position: Array
+    rotation: Array
+    lens: Lens
 
     def project(self, points: ArrayLike) -> Array:
         """Pixels (..., 2), distortion included, of ground points (..., 3); NaN behind the camera."""

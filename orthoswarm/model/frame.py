@@ -25,41 +25,65 @@ degrees."""
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """The recorded pose of a camera at a picture, an observation with errors; None where unknown."""
+    """The recorded pose of a camera at a picture, an observation with errors; None where unknown.
 
-    lat_deg: float  # latitude, WGS 84
-    lon_deg: float  # longitude
-    height_m: float | None = None  # height above the takeoff level (or above ground where a source knows it)
+    Attributes:
+        lat_deg, lon_deg: latitude and longitude, WGS 84.
+        height_m: height above the takeoff level (or above ground where a source knows it).
+        altitude_m: absolute altitude (sea level or ellipsoid); never used as a height.
+        yaw_rad: azimuth of the picture's up direction at nadir, clockwise from true north.
+        pitch_rad: -pi/2 looks straight down.
+        roll_rad: > 0 right side down.
+        flight_yaw_rad: heading of the airframe, where it is recorded besides the camera's yaw.
+        position_sigma_m: one sigma of the horizontal position, if the source states it (RTK).
+        height_is_ground: True where the height is above the ground below (rangefinder), not above takeoff.
+    """
+
+    lat_deg: float
+    lon_deg: float
+    height_m: float | None = None
     _: KW_ONLY
-    altitude_m: float | None = None  # absolute altitude (sea level or ellipsoid); never used as a height
-    yaw_rad: float | None = None  # azimuth of the picture's up direction at nadir, clockwise from true north
-    pitch_rad: float | None = None  # -pi/2 looks straight down
-    roll_rad: float | None = None  # > 0 right side down
-    flight_yaw_rad: float | None = None  # heading of the airframe, where it is recorded besides the camera's yaw
-    position_sigma_m: float | None = None  # one sigma of the horizontal position, if the source states it (RTK)
-    height_is_ground: bool = False  # True where the height is above the ground below (rangefinder), not above takeoff
+    altitude_m: float | None = None
+    yaw_rad: float | None = None
+    pitch_rad: float | None = None
+    roll_rad: float | None = None
+    flight_yaw_rad: float | None = None
+    position_sigma_m: float | None = None
+    height_is_ground: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Frame:
-    """One picture and its fix."""
+    """One picture and its fix.
 
-    image: str  # its name in all products (path relative to the input with forward slashes; `video.mp4#000123`)
-    path: Path  # the readable picture file on this machine (for a video, the extracted picture)
-    vehicle: str  # id of the vehicle that took it
-    time_s: float | None  # UTC epoch seconds, None if unknown
-    fix: Fix  # the recorded pose
-    width: int  # columns as stored in the file (EXIF rotation not applied)
-    height: int  # rows
-    # distinguishes lenses of one vehicle (model, size, zoom); frames of equal `vehicle` and `camera` share one lens
+    Attributes:
+        image: its name in all products (path relative to the input with forward slashes; `video.mp4#000123`).
+        path: the readable picture file on this machine (for a video, the extracted picture).
+        vehicle: id of the vehicle that took it.
+        time_s: UTC epoch seconds, None if unknown.
+        fix: the recorded pose.
+        width, height: columns and rows as stored in the file (EXIF rotation not applied).
+        camera: distinguishes lenses of one vehicle (model, size, zoom); frames of equal `vehicle` and `camera`
+            share one lens.
+        fov_hint_rad: horizontal field of view from the picture's own tags, None if there is none.
+        origin: field -> source, for `inspect` and the report.
+        damaged: True if parts of the picture were predicted from lost data: it is used for its position only,
+            and is drawn only where there is no other picture.
+        ambiguous: True where the position is that of one of several camera events of a log, and nothing tells
+            of which; the fix's sigma covers the others.
+    """
+
+    image: str
+    path: Path
+    vehicle: str
+    time_s: float | None
+    fix: Fix
+    width: int
+    height: int
     camera: str = ""
-    fov_hint_rad: float | None = None  # horizontal field of view from the picture's own tags, None if there is none
-    origin: dict[str, str] = field(default_factory=dict, compare=False)  # field -> source, for `inspect` and the report
-    # True if parts of the picture were predicted from lost data: it is used for its position only, and is drawn only
-    # where there is no other picture
+    fov_hint_rad: float | None = None
+    origin: dict[str, str] = field(default_factory=dict, compare=False)
     damaged: bool = False
-    # True where the position is that of one of several camera events of a log, and nothing tells of which; the fix's
-    # sigma covers the others
     ambiguous: bool = False
 
     @property
@@ -79,15 +103,24 @@ def last_time(frames: Iterable[Frame]) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class Rejection:
-    """A picture that could not become a frame, or that was left out later."""
+    """A picture that could not become a frame, or that was left out later.
 
-    image: str  # its name
-    reason: str  # one clear sentence
-    vehicle: str = ""  # as far as known
-    time_s: float | None = None  # as far as known
-    lacks_position: bool = False  # True if only a position is missing, which a later log may provide
+    Attributes:
+        image: its name.
+        reason: one clear sentence.
+        vehicle: as far as known.
+        time_s: as far as known.
+        lacks_position: True if only a position is missing, which a later log may provide.
+        detail: what is particular to this picture; the reason is the same for all that share it, so that it is
+            counted.
+    """
+
+    image: str
+    reason: str
+    vehicle: str = ""
+    time_s: float | None = None
+    lacks_position: bool = False
     _: KW_ONLY
-    # what is particular to this picture; the reason is the same for all that share it, so that it is counted
     detail: str = ""
 
     @property
@@ -98,11 +131,17 @@ class Rejection:
 
 @dataclass(frozen=True, slots=True)
 class Ingest:
-    """The result of reading a set of inputs."""
+    """The result of reading a set of inputs.
 
-    frames: list[Frame]  # sorted by vehicle, then time (then name where times are unknown)
-    rejected: list[Rejection]  # every file with a picture's suffix, or picture of a video, that is not a frame
-    warnings: list[str]  # findings that a user should read, in plain words
-    # photos that are rejected for nothing but the lack of a position (latitude and longitude of their fix are NaN), by
-    # vehicle, then time: surveyed points may place them
+    Attributes:
+        frames: sorted by vehicle, then time (then name where times are unknown).
+        rejected: every file with a picture's suffix, or picture of a video, that is not a frame.
+        warnings: findings that a user should read, in plain words.
+        unpositioned: photos that are rejected for nothing but the lack of a position (latitude and longitude of
+            their fix are NaN), by vehicle, then time: surveyed points may place them.
+    """
+
+    frames: list[Frame]
+    rejected: list[Rejection]
+    warnings: list[str]
     unpositioned: list[Frame] = field(default_factory=list)

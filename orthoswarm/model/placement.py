@@ -23,17 +23,25 @@ lengths."""
 
 @dataclass(frozen=True, slots=True)
 class PlacedFrame:
-    """A frame with its camera in the area's grid."""
+    """A frame with its camera in the area's grid.
 
-    frame: Frame  # the picture
-    camera: Camera  # position (east, north, height over the common datum), orientation and lens
-    stage: Stage  # how far it was refined
-    sigma_m: float  # own estimate of the ground error at the picture's central pixel, one sigma per axis, metres
-    # True where too few observations hold it; it is placed but left out of the mosaic while others cover
+    Attributes:
+        frame: the picture.
+        camera: position (east, north, height over the common datum), orientation and lens.
+        stage: how far it was refined.
+        sigma_m: own estimate of the ground error at the picture's central pixel, one sigma per axis, metres.
+        weak: True where too few observations hold it; it is placed but left out of the mosaic while others
+            cover.
+        pose_covariance: float32 (6, 6) of position (east, north, up, metres) and rotation about the camera's
+            axes (radians) in the adjustment, without errors common to all frames; None where it is not known.
+    """
+
+    frame: Frame
+    camera: Camera
+    stage: Stage
+    sigma_m: float
     weak: bool = False
     _: KW_ONLY
-    # float32 (6, 6) of position (east, north, up, metres) and rotation about the camera's axes (radians) in the
-    # adjustment, without errors common to all frames; None where it is not known
     pose_covariance: NDArray[np.float32] | None = field(default=None, compare=False)
 
     def reduced(self, factor: int) -> "PlacedFrame":
@@ -45,17 +53,26 @@ class PlacedFrame:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Leg:
-    """A straight run of one vehicle's frames, and how well the map held it."""
+    """A straight run of one vehicle's frames, and how well the map held it.
 
-    vehicle: str  # id
-    first: int  # index of its first frame among the vehicle's solved frames, lens after lens
-    last: int  # of its last, inclusive
-    images: tuple[str, str]  # names of both
-    # matched to the map by evidence of its own; carried by legs that were, of its vehicle or of neighbours; failed: it
-    # lies where the receiver says
+    Attributes:
+        vehicle: id.
+        first: index of its first frame among the vehicle's solved frames, lens after lens.
+        last: of its last, inclusive.
+        images: names of both.
+        state: matched to the map by evidence of its own; carried by legs that were, of its vehicle or of
+            neighbours; failed: it lies where the receiver says.
+        confidence: 0 to 1.
+        sigma_m: own error estimate in metres.
+    """
+
+    vehicle: str
+    first: int
+    last: int
+    images: tuple[str, str]
     state: LegState = "failed"
-    confidence: float = 0.0  # 0 to 1
-    sigma_m: float = float("nan")  # own error estimate in metres
+    confidence: float = 0.0
+    sigma_m: float = float("nan")
 
     @classmethod
     def of(
@@ -76,17 +93,24 @@ class Leg:
 
 @dataclass(frozen=True, slots=True)
 class Terrain:
-    """Ground height on a regular grid of nodes, bilinear between them, constant beyond the border."""
+    """Ground height on a regular grid of nodes, bilinear between them, constant beyond the border.
 
-    west: float  # easting of node column 0
-    south: float  # northing of node row 0 (rows go north), metres
-    step_m: float  # distance of nodes
-    z: NDArray[np.float32]  # float32 (rows, columns), metres over the datum of the cameras
+    Attributes:
+        west: easting of node column 0.
+        south: northing of node row 0 (rows go north), metres.
+        step_m: distance of nodes.
+        z: float32 (rows, columns), metres over the datum of the cameras.
+        bare: the same without tall surfaces (halls, woods); None where z has no such tops.
+        tops: up to where something may stand: what was found, drawn on its top or not, and what may be there
+            where the pictures did not decide; None where nothing stands.
+    """
+
+    west: float
+    south: float
+    step_m: float
+    z: NDArray[np.float32]
     _: KW_ONLY
-    # the same without tall surfaces (halls, woods); None where z has no such tops
     bare: NDArray[np.float32] | None = None
-    # up to where something may stand: what was found, drawn on its top or not, and what may be there where the pictures
-    # did not decide; None where nothing stands
     tops: NDArray[np.float32] | None = None
 
     @classmethod
@@ -131,26 +155,41 @@ class Terrain:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Solution:
-    """What a refiner made of one vehicle."""
+    """What a refiner made of one vehicle.
 
-    vehicle: str  # id
-    placed: list[PlacedFrame]  # its frames in order, those it could place
-    dropped: Mapping[str, str]  # image -> reason for those it could not
-    legs: list[Leg]  # its legs
-    fov_deg: float  # estimated horizontal field of view of its (main) camera
-    fov_sigma_deg: float  # one sigma
-    terrain: Terrain | None  # ground height under its frames (same datum as the cameras), None for flat at `ground_z_m`
-    ground_z_m: float = 0.0  # level of the ground that its vehicles map, the plane on which homographies are stated
-    map_lean: tuple[float, float] = (0.0, 0.0)  # metres of shift per metre of height in the basemap, (east, north)
-    state: Any = None  # what a second pass needs (refiner's own, picklable)
-    warnings: list[str] = field(default_factory=list)  # findings in plain words (yaw flips, wrong altitude, lag...)
-    timings: dict[str, float] = field(default_factory=dict)  # stage name -> CPU seconds, for the report
-    # mean size of its pictures' pixels on the ground: height above the mean of the points that count as ground (rubble
-    # and hedges among them, so it is a little above the plane of the homographies) over the focal length. NaN where not
-    # known
+    Attributes:
+        vehicle: id.
+        placed: its frames in order, those it could place.
+        dropped: image -> reason for those it could not.
+        legs: its legs.
+        fov_deg: estimated horizontal field of view of its (main) camera.
+        fov_sigma_deg: one sigma.
+        terrain: ground height under its frames (same datum as the cameras), None for flat at `ground_z_m`.
+        ground_z_m: level of the ground that its vehicles map, the plane on which homographies are stated.
+        map_lean: metres of shift per metre of height in the basemap, (east, north).
+        state: what a second pass needs (refiner's own, picklable).
+        warnings: findings in plain words (yaw flips, wrong altitude, lag...).
+        timings: stage name -> CPU seconds, for the report.
+        gsd_m: mean size of its pictures' pixels on the ground: height above the mean of the points that count
+            as ground (rubble and hedges among them, so it is a little above the plane of the homographies) over
+            the focal length. NaN where not known.
+        false_matches: how many registrations as good as this one a map of other ground would give (expected
+            number); NaN where the map did not register it.
+    """
+
+    vehicle: str
+    placed: list[PlacedFrame]
+    dropped: Mapping[str, str]
+    legs: list[Leg]
+    fov_deg: float
+    fov_sigma_deg: float
+    terrain: Terrain | None
+    ground_z_m: float = 0.0
+    map_lean: tuple[float, float] = (0.0, 0.0)
+    state: Any = None
+    warnings: list[str] = field(default_factory=list)
+    timings: dict[str, float] = field(default_factory=dict)
     gsd_m: float = float("nan")
-    # how many registrations as good as this one a map of other ground would give (expected number); NaN where the map
-    # did not register it
     false_matches: float = float("nan")
 
 
@@ -173,13 +212,21 @@ class MapWindow(Protocol):
 
 @dataclass(slots=True)
 class Refinement:
-    """What a refiner made of a batch."""
+    """What a refiner made of a batch.
 
-    coarse: list[Solution]  # one solution a vehicle before the map was used
-    fine: list[Solution]  # the same vehicles in the same order after it
-    terrain: Terrain | None  # ground under the fine cameras, None for flat
-    warnings: list[str] = field(default_factory=list)  # findings that concern all vehicles
-    # predicted and measured time by the paper's Eq. 5; empty where the refiner does not work by it
+    Attributes:
+        coarse: one solution a vehicle before the map was used.
+        fine: the same vehicles in the same order after it.
+        terrain: ground under the fine cameras, None for flat.
+        warnings: findings that concern all vehicles.
+        equation_5: predicted and measured time by the paper's Eq. 5; empty where the refiner does not work by
+            it.
+    """
+
+    coarse: list[Solution]
+    fine: list[Solution]
+    terrain: Terrain | None
+    warnings: list[str] = field(default_factory=list)
     equation_5: Mapping[str, float] = field(default_factory=dict)
 
 

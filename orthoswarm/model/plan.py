@@ -13,17 +13,25 @@ End = Literal["rtl", "land", "hover"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Waypoint:
-    """A point that is flown to in a straight line from the one before."""
+    """A point that is flown to in a straight line from the one before.
 
-    lat_deg: float  # latitude, degrees
-    lon_deg: float  # longitude, degrees
-    height_m: float  # height above the takeoff point, metres
-    # True at a leg's first point (pictures by distance begin as soon as it is reached), False at a leg's last point
-    # (they stop), None where nothing changes
+    Attributes:
+        lat_deg, lon_deg: latitude and longitude, degrees.
+        height_m: height above the takeoff point, metres.
+        camera: True at a leg's first point (pictures by distance begin as soon as it is reached), False at a
+            leg's last point (they stop), None where nothing changes.
+        above_ground_m: nominal height above the ground where heights follow it, else None.
+        between: the point lies on a straight way and was put in for its height alone.
+        wait_s: how long the vehicle stays there before it flies on.
+    """
+
+    lat_deg: float
+    lon_deg: float
+    height_m: float
     camera: bool | None = None
-    above_ground_m: float | None = None  # nominal height above the ground where heights follow it, else None
-    between: bool = False  # the point lies on a straight way and was put in for its height alone
-    wait_s: float = 0.0  # how long the vehicle stays there before it flies on
+    above_ground_m: float | None = None
+    between: bool = False
+    wait_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,19 +40,28 @@ class Sortie:
 
     The way out and the way home are among the waypoints, around no-fly zones. With `end` "rtl" or "land" the last
     waypoint lies above the home position; with "hover" it is the end of the last leg.
+
+    Attributes:
+        home_lat_deg, home_lon_deg: latitude and longitude of the takeoff point.
+        takeoff_height_m: height to climb to before the first waypoint, metres.
+        waypoints: the points in order; `camera` marks the legs.
+        start_s: when the sortie takes off, seconds after the swarm's start (keeps vehicles apart; changing
+            batteries is in it for a second sortie).
+        time_s: time from takeoff to the end, seconds.
+        length_m: horizontal length of the whole path from takeoff to the end, metres.
+        turns: changes of direction by more than ten degrees on the path.
+        photos: pictures that the trigger distance gives on the legs.
     """
 
-    home_lat_deg: float  # latitude of the takeoff point; home_lon_deg its longitude
+    home_lat_deg: float
     home_lon_deg: float
-    takeoff_height_m: float  # height to climb to before the first waypoint, metres
-    waypoints: tuple[Waypoint, ...]  # the points in order; `camera` marks the legs
-    # when the sortie takes off, seconds after the swarm's start (keeps vehicles apart; changing batteries is in it for
-    # a second sortie)
+    takeoff_height_m: float
+    waypoints: tuple[Waypoint, ...]
     start_s: float
-    time_s: float  # time from takeoff to the end, seconds
-    length_m: float  # horizontal length of the whole path from takeoff to the end, metres
-    turns: int  # changes of direction by more than ten degrees on the path
-    photos: int  # pictures that the trigger distance gives on the legs
+    time_s: float
+    length_m: float
+    turns: int
+    photos: int
 
     @property
     def legs(self) -> tuple[tuple[Waypoint, Waypoint], ...]:
@@ -56,10 +73,15 @@ class Sortie:
 
 @dataclass(frozen=True, slots=True)
 class VehiclePlan:
-    """Everything one vehicle flies."""
+    """Everything one vehicle flies.
 
-    number: int  # 1, 2, ... in the plan; by default also the MAVLink system id it is meant for
-    sorties: tuple[Sortie, ...]  # its flights in order; a later one resumes where the one before stopped
+    Attributes:
+        number: 1, 2, ... in the plan; by default also the MAVLink system id it is meant for.
+        sorties: its flights in order; a later one resumes where the one before stopped.
+    """
+
+    number: int
+    sorties: tuple[Sortie, ...]
 
     @property
     def id(self) -> str:
@@ -94,40 +116,63 @@ class VehiclePlan:
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """A piece of the area that no picture of the narrowest camera is sure to see."""
+    """A piece of the area that no picture of the narrowest camera is sure to see.
 
-    lat_deg: float  # latitude of a point in it; lon_deg its longitude
+    Attributes:
+        lat_deg, lon_deg: latitude and longitude of a point in it.
+        area_m2: its size, square metres.
+    """
+
+    lat_deg: float
     lon_deg: float
-    area_m2: float  # its size, square metres
+    area_m2: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OverGround:
-    """How a plan lies over a height model, metres above the ground straight below unless said otherwise."""
+    """How a plan lies over a height model, metres above the ground straight below unless said otherwise.
 
-    follows: bool  # legs keep a constant height above the ground; else all legs lie at one height
-    # mission items are to state heights above the ground, which the vehicle keeps by a model of its own
+    Attributes:
+        follows: legs keep a constant height above the ground; else all legs lie at one height.
+        by_vehicle: mission items are to state heights above the ground, which the vehicle keeps by a model of
+            its own.
+        nominal_m: height above the ground that was asked for.
+        least_m: lowest point of the legs.
+        most_m: highest.
+        way_least_m: lowest point of the flights but for takeoff and landing, above the highest ground up to
+            `beside_m` from it.
+        top_m: highest point of the flights, above their takeoff.
+        side_overlap: of neighbouring lines: the 5th percentile along the legs, and the median.
+        forward_overlap: of consecutive pictures at the lowest point of the legs.
+        return_height_m: above takeoff, at which a straight way home passes over all ground and what stands on
+            it.
+    """
+
+    follows: bool
     by_vehicle: bool
-    nominal_m: float  # height above the ground that was asked for
-    least_m: float  # lowest point of the legs
-    most_m: float  # highest
-    # lowest point of the flights but for takeoff and landing, above the highest ground up to `beside_m` from it
+    nominal_m: float
+    least_m: float
+    most_m: float
     way_least_m: float
-    top_m: float  # highest point of the flights, above their takeoff
-    side_overlap: tuple[float, float]  # of neighbouring lines: the 5th percentile along the legs, and the median
-    forward_overlap: float  # of consecutive pictures at the lowest point of the legs
-    # above takeoff, at which a straight way home passes over all ground and what stands on it
+    top_m: float
+    side_overlap: tuple[float, float]
+    forward_overlap: float
     return_height_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fence:
-    """A geofence that goes with a plan."""
+    """A geofence that goes with a plan.
 
-    inclusion: bool  # flights must stay inside it, else outside
-    # latitude and longitude in degrees of a polygon's corners, or of a circle's centre
+    Attributes:
+        inclusion: flights must stay inside it, else outside.
+        points: latitude and longitude in degrees of a polygon's corners, or of a circle's centre.
+        radius_m: of a circle, None for a polygon.
+    """
+
+    inclusion: bool
     points: tuple[tuple[float, float], ...]
-    radius_m: float | None = None  # of a circle, None for a polygon
+    radius_m: float | None = None
 
 
 class Apart(NamedTuple):
@@ -146,28 +191,47 @@ PAD_DISTANCES: Final = 1.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """Missions for a swarm over one area, or along given lines."""
+    """Missions for a swarm over one area, or along given lines.
 
-    method: str  # "columns", "bcd", "tmstc", or "lines" where a given polyline is followed
-    vehicles: tuple[VehiclePlan, ...]  # what each vehicle flies, by number
-    altitude_m: float  # height of the legs above takeoff, metres; above the ground where they follow it
-    speed_m_s: float  # planned ground speed, metres per second
-    trigger_m: float  # distance between pictures on a leg, metres
-    spacing_m: float  # largest distance between neighbouring lines, metres
-    # width (across the leg) and height (along it) of the narrowest camera's picture on the ground
+    Attributes:
+        method: "columns", "bcd", "tmstc", or "lines" where a given polyline is followed.
+        vehicles: what each vehicle flies, by number.
+        altitude_m: height of the legs above takeoff, metres; above the ground where they follow it.
+        speed_m_s: planned ground speed, metres per second.
+        trigger_m: distance between pictures on a leg, metres.
+        spacing_m: largest distance between neighbouring lines, metres.
+        footprint_m: width (across the leg) and height (along it) of the narrowest camera's picture on the
+            ground.
+        end: what a sortie does at last.
+        epsg: UTM grid in which the plan was made.
+        area_m2: size of the area, square metres; None along given lines.
+        covered_share: share of the area that is seen for certain, 0 to 1; None along given lines.
+        gaps: what is missed, largest first.
+        separation: how vehicles are kept apart, in words.
+        warnings: what the user should know.
+        over_ground: how it lies over the height model, None without one.
+        fences: geofences that vehicles are to hold while they fly it.
+        apart: how far apart vehicles are at any time, horizontally or in height; None where that is not known.
+        gimbal_pitch_deg: to which missions turn the gimbal, -90 straight down; None where they leave it alone.
+    """
+
+    method: str
+    vehicles: tuple[VehiclePlan, ...]
+    altitude_m: float
+    speed_m_s: float
+    trigger_m: float
+    spacing_m: float
     footprint_m: tuple[float, float]
-    end: End  # what a sortie does at last
-    epsg: int  # UTM grid in which the plan was made
-    area_m2: float | None  # size of the area, square metres; None along given lines
-    covered_share: float | None  # share of the area that is seen for certain, 0 to 1; None along given lines
-    gaps: tuple[Gap, ...]  # what is missed, largest first
-    separation: str  # how vehicles are kept apart, in words
-    warnings: tuple[str, ...]  # what the user should know
-    over_ground: OverGround | None = None  # how it lies over the height model, None without one
-    fences: tuple[Fence, ...] = ()  # geofences that vehicles are to hold while they fly it
-    # how far apart vehicles are at any time, horizontally or in height; None where that is not known
+    end: End
+    epsg: int
+    area_m2: float | None
+    covered_share: float | None
+    gaps: tuple[Gap, ...]
+    separation: str
+    warnings: tuple[str, ...]
+    over_ground: OverGround | None = None
+    fences: tuple[Fence, ...] = ()
     apart: Apart | None = None
-    # to which missions turn the gimbal, -90 straight down; None where they leave it alone
     gimbal_pitch_deg: float | None = None
 
     @property

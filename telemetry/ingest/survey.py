@@ -16,23 +16,34 @@ from telemetry.samples.sample import Sample
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoadOptions:
-    """Options for reading inputs."""
+    """Options for reading inputs.
 
-    # distance between pictures extracted from a video, metres; None for the default of `picture_choice`
+    Attributes:
+        every_m: distance between pictures extracted from a video, metres; None for the default of
+            `picture_choice`.
+        every_s: seconds between them.
+        cache: folder for pictures extracted from videos; None makes one under the system's temporary folder.
+        exclude: files and folders that are left out (the output folder, for instance).
+        workers: threads that read.
+        camera: which sensor of cameras with several is mapped: wide, zoom or thermal; "" for the widest in
+            colour.
+        band: which spectral band of multispectral cameras is mapped; "" for colour, else the one that shows
+            most.
+        decode: False to read only the metadata of videos, without extracting pictures (for `inspect`).
+        run: maps a function over items in processes, for many photos; None: read in threads.
+        sei_layouts: files that describe private SEI messages; see `telemetry.formats.video.sei`.
+    """
+
     every_m: float | None = None
-    every_s: float | None = None  # seconds between them
-    # folder for pictures extracted from videos; None makes one under the system's temporary folder
+    every_s: float | None = None
     cache: Path | None = None
-    exclude: tuple[Path, ...] = ()  # files and folders that are left out (the output folder, for instance)
-    workers: int = field(default_factory=lambda: min(8, (os.cpu_count() or 1) * 2))  # threads that read
-    # which sensor of cameras with several is mapped: wide, zoom or thermal; "" for the widest in colour
+    exclude: tuple[Path, ...] = ()
+    workers: int = field(default_factory=lambda: min(8, (os.cpu_count() or 1) * 2))
     camera: str = ""
-    # which spectral band of multispectral cameras is mapped; "" for colour, else the one that shows most
     band: str = ""
-    decode: bool = True  # False to read only the metadata of videos, without extracting pictures (for `inspect`)
-    # maps a function over items in processes, for many photos; None: read in threads
+    decode: bool = True
     run: Callable[..., Iterator[Any]] | None = None
-    sei_layouts: tuple[Path, ...] = ()  # files that describe private SEI messages; see `telemetry.formats.video.sei`
+    sei_layouts: tuple[Path, ...] = ()
 
 
 @dataclass(slots=True, kw_only=True)

@@ -1,5 +1,6 @@
 """The examples of docs/api.md run as they stand, one after the other; and the face has what it says."""
 
+import dataclasses
 import importlib
 import json
 import re
@@ -20,6 +21,9 @@ EXAMPLES = re.findall(r"```python\n(.*?)```", TEXT, flags=re.DOTALL)
 def test_all_names_of_the_face_are_there_and_documented(package):
     face = importlib.import_module(package)
     assert all(getattr(face, name).__doc__ or name == "Progress" for name in face.__all__)
+    for record in filter(dataclasses.is_dataclass, (getattr(face, name) for name in face.__all__)):
+        explained = record.__doc__.partition("Attributes:")[2]
+        assert [f.name for f in dataclasses.fields(record) if not re.search(rf"\b{f.name}\b", explained)] == [], record
     with pytest.raises(AttributeError):
         face.no_such_name  # noqa: B018
     assert (Path(face.__file__).parent / "py.typed").exists()
