@@ -56,10 +56,10 @@ Pair = tuple[int, int]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FleetEvent:
-    """Something that happened to a vehicle, in one sentence.
+    """Something that happened to a vehicle.
 
     Attributes:
-        system: its MAVLink system id. time_s: UTC epoch seconds. text: one sentence.
+        system: its MAVLink system id. time_s: UTC epoch seconds. text: what happened, in one sentence.
         kind: `found`, `lost`, `regained`, `rebooted`, `link` (commands go another way), `conflict` (several vehicles
             with one system id), `single` (no longer), `near` (too near another vehicle), `apart` (no longer), `behind`
             (later on its mission than plans allow for), `caught_up` (no longer), `danger` (`Vehicle.danger`), `safe`

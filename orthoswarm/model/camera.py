@@ -64,14 +64,8 @@ class Lens:
     x_d = x_u (1 + k1 r2 + k2 r2^2 + k3 r2^3) with x in units of f about ((W-1)/2 + cx, (H-1)/2 + cy).
 
     Attributes:
-        width: columns of the picture.
-        height: rows.
-        focal_px: focal length in pixels of the undistorted pinhole.
-        k1: first radial term.
-        k2: second.
-        k3: third.
-        cx: offset of the principal point from the centre in pixels, columns.
-        cy: rows.
+        width, height: columns and rows of the picture. focal_px: focal length in pixels of the undistorted pinhole.
+        k1, k2, k3: radial terms. cx, cy: offset of the principal point from the centre in pixels, columns and rows.
     """
 
     width: int
@@ -157,10 +151,9 @@ class Camera:
     """Exterior and interior orientation of a picture.
 
     Attributes:
-        position: float64 (3,), easting, northing, height in metres (heights share the datum of the ground
-            plane).
+        position: float64 (3,), easting, northing, height in metres (heights share the datum of the ground plane).
         rotation: float64 (3, 3), camera to ground; columns are the camera's axes in east, north, up.
-        lens: its lens.
+        lens: interior orientation.
     """
 
     position: Array

@@ -32,8 +32,7 @@ class Fix:
         height_m: height above the takeoff level (or above ground where a source knows it).
         altitude_m: absolute altitude (sea level or ellipsoid); never used as a height.
         yaw_rad: azimuth of the picture's up direction at nadir, clockwise from true north.
-        pitch_rad: -pi/2 looks straight down.
-        roll_rad: > 0 right side down.
+        pitch_rad: -pi/2 looks straight down. roll_rad: > 0 right side down.
         flight_yaw_rad: heading of the airframe, where it is recorded besides the camera's yaw.
         position_sigma_m: one sigma of the horizontal position, if the source states it (RTK).
         height_is_ground: True where the height is above the ground below (rangefinder), not above takeoff.
@@ -59,18 +58,16 @@ class Frame:
     Attributes:
         image: its name in all products (path relative to the input with forward slashes; `video.mp4#000123`).
         path: the readable picture file on this machine (for a video, the extracted picture).
-        vehicle: id of the vehicle that took it.
-        time_s: UTC epoch seconds, None if unknown.
-        fix: the recorded pose.
+        vehicle: id of the vehicle that took it. time_s: UTC epoch seconds, None if unknown. fix: the recorded pose.
         width, height: columns and rows as stored in the file (EXIF rotation not applied).
-        camera: distinguishes lenses of one vehicle (model, size, zoom); frames of equal `vehicle` and `camera`
-            share one lens.
+        camera: distinguishes lenses of one vehicle (model, size, zoom); frames of equal `vehicle` and `camera` share
+            one lens.
         fov_hint_rad: horizontal field of view from the picture's own tags, None if there is none.
         origin: field -> source, for `inspect` and the report.
-        damaged: True if parts of the picture were predicted from lost data: it is used for its position only,
-            and is drawn only where there is no other picture.
-        ambiguous: True where the position is that of one of several camera events of a log, and nothing tells
-            of which; the fix's sigma covers the others.
+        damaged: True if parts of the picture were predicted from lost data: it is used for its position only, and is
+            drawn only where there is no other picture.
+        ambiguous: True where the position is that of one of several camera events of a log, and nothing tells of which;
+            the fix's sigma covers the others.
     """
 
     image: str
@@ -106,13 +103,9 @@ class Rejection:
     """A picture that could not become a frame, or that was left out later.
 
     Attributes:
-        image: its name.
-        reason: one clear sentence.
-        vehicle: as far as known.
-        time_s: as far as known.
+        image: its name. reason: one clear sentence. vehicle, time_s: as far as known, see `Frame`.
         lacks_position: True if only a position is missing, which a later log may provide.
-        detail: what is particular to this picture; the reason is the same for all that share it, so that it is
-            counted.
+        detail: what is particular to this picture; the reason is the same for all that share it, so that it is counted.
     """
 
     image: str
@@ -137,8 +130,8 @@ class Ingest:
         frames: sorted by vehicle, then time (then name where times are unknown).
         rejected: every file with a picture's suffix, or picture of a video, that is not a frame.
         warnings: findings that a user should read, in plain words.
-        unpositioned: photos that are rejected for nothing but the lack of a position (latitude and longitude of
-            their fix are NaN), by vehicle, then time: surveyed points may place them.
+        unpositioned: photos that are rejected for nothing but the lack of a position (latitude and longitude of their
+            fix are NaN), by vehicle, then time: surveyed points may place them.
     """
 
     frames: list[Frame]

@@ -26,14 +26,12 @@ class PlacedFrame:
     """A frame with its camera in the area's grid.
 
     Attributes:
-        frame: the picture.
-        camera: position (east, north, height over the common datum), orientation and lens.
+        frame: the picture. camera: position (east, north, height over the common datum), orientation and lens.
         stage: how far it was refined.
         sigma_m: own estimate of the ground error at the picture's central pixel, one sigma per axis, metres.
-        weak: True where too few observations hold it; it is placed but left out of the mosaic while others
-            cover.
-        pose_covariance: float32 (6, 6) of position (east, north, up, metres) and rotation about the camera's
-            axes (radians) in the adjustment, without errors common to all frames; None where it is not known.
+        weak: True where too few observations hold it; it is placed but left out of the mosaic while others cover.
+        pose_covariance: float32 (6, 6) of position (east, north, up, metres) and rotation about the camera's axes
+            (radians) in the adjustment, without errors common to all frames; None where it is not known.
     """
 
     frame: Frame
@@ -57,13 +55,11 @@ class Leg:
 
     Attributes:
         vehicle: id.
-        first: index of its first frame among the vehicle's solved frames, lens after lens.
-        last: of its last, inclusive.
+        first, last: indices of its first and last frame among the vehicle's solved frames, lens after lens.
         images: names of both.
-        state: matched to the map by evidence of its own; carried by legs that were, of its vehicle or of
-            neighbours; failed: it lies where the receiver says.
-        confidence: 0 to 1.
-        sigma_m: own error estimate in metres.
+        state: matched to the map by evidence of its own; carried by legs that were, of its vehicle or of neighbours;
+            failed: it lies where the receiver says.
+        confidence: 0 to 1. sigma_m: own error estimate in metres.
     """
 
     vehicle: str
@@ -96,13 +92,11 @@ class Terrain:
     """Ground height on a regular grid of nodes, bilinear between them, constant beyond the border.
 
     Attributes:
-        west: easting of node column 0.
-        south: northing of node row 0 (rows go north), metres.
-        step_m: distance of nodes.
-        z: float32 (rows, columns), metres over the datum of the cameras.
+        west, south: easting of node column 0 and northing of node row 0 (rows go north), metres.
+        step_m: distance of nodes. z: float32 (rows, columns), metres over the datum of the cameras.
         bare: the same without tall surfaces (halls, woods); None where z has no such tops.
-        tops: up to where something may stand: what was found, drawn on its top or not, and what may be there
-            where the pictures did not decide; None where nothing stands.
+        tops: up to where something may stand: what was found, drawn on its top or not, and what may be there where the
+            pictures did not decide; None where nothing stands.
     """
 
     west: float
@@ -158,23 +152,19 @@ class Solution:
     """What a refiner made of one vehicle.
 
     Attributes:
-        vehicle: id.
-        placed: its frames in order, those it could place.
-        dropped: image -> reason for those it could not.
-        legs: its legs.
-        fov_deg: estimated horizontal field of view of its (main) camera.
-        fov_sigma_deg: one sigma.
+        vehicle: id. placed: its frames in order, those it could place. dropped: image -> reason for those it could not.
+        legs: its legs. fov_deg, fov_sigma_deg: estimated horizontal field of view of its (main) camera, and its sigma.
         terrain: ground height under its frames (same datum as the cameras), None for flat at `ground_z_m`.
         ground_z_m: level of the ground that its vehicles map, the plane on which homographies are stated.
         map_lean: metres of shift per metre of height in the basemap, (east, north).
         state: what a second pass needs (refiner's own, picklable).
         warnings: findings in plain words (yaw flips, wrong altitude, lag...).
         timings: stage name -> CPU seconds, for the report.
-        gsd_m: mean size of its pictures' pixels on the ground: height above the mean of the points that count
-            as ground (rubble and hedges among them, so it is a little above the plane of the homographies) over
-            the focal length. NaN where not known.
-        false_matches: how many registrations as good as this one a map of other ground would give (expected
-            number); NaN where the map did not register it.
+        gsd_m: mean size of its pictures' pixels on the ground: height above the mean of the points that count as ground
+            (rubble and hedges among them, so it is a little above the plane of the homographies) over the focal length.
+            NaN where not known.
+        false_matches: how many registrations as good as this one a map of other ground would give (expected number);
+            NaN where the map did not register it.
     """
 
     vehicle: str
@@ -215,12 +205,9 @@ class Refinement:
     """What a refiner made of a batch.
 
     Attributes:
-        coarse: one solution a vehicle before the map was used.
-        fine: the same vehicles in the same order after it.
-        terrain: ground under the fine cameras, None for flat.
-        warnings: findings that concern all vehicles.
-        equation_5: predicted and measured time by the paper's Eq. 5; empty where the refiner does not work by
-            it.
+        coarse: one solution a vehicle before the map was used. fine: the same vehicles in the same order after it.
+        terrain: ground under the fine cameras, None for flat. warnings: findings that concern all vehicles.
+        equation_5: predicted and measured time by the paper's Eq. 5; empty where the refiner does not work by it.
     """
 
     coarse: list[Solution]

@@ -16,10 +16,9 @@ class Waypoint:
     """A point that is flown to in a straight line from the one before.
 
     Attributes:
-        lat_deg, lon_deg: latitude and longitude, degrees.
-        height_m: height above the takeoff point, metres.
-        camera: True at a leg's first point (pictures by distance begin as soon as it is reached), False at a
-            leg's last point (they stop), None where nothing changes.
+        lat_deg, lon_deg: latitude and longitude, degrees. height_m: height above the takeoff point, metres.
+        camera: True at a leg's first point (pictures by distance begin as soon as it is reached), False at a leg's last
+            point (they stop), None where nothing changes.
         above_ground_m: nominal height above the ground where heights follow it, else None.
         between: the point lies on a straight way and was put in for its height alone.
         wait_s: how long the vehicle stays there before it flies on.
@@ -45,8 +44,8 @@ class Sortie:
         home_lat_deg, home_lon_deg: latitude and longitude of the takeoff point.
         takeoff_height_m: height to climb to before the first waypoint, metres.
         waypoints: the points in order; `camera` marks the legs.
-        start_s: when the sortie takes off, seconds after the swarm's start (keeps vehicles apart; changing
-            batteries is in it for a second sortie).
+        start_s: when the sortie takes off, seconds after the swarm's start (keeps vehicles apart; changing batteries is
+            in it for a second sortie).
         time_s: time from takeoff to the end, seconds.
         length_m: horizontal length of the whole path from takeoff to the end, metres.
         turns: changes of direction by more than ten degrees on the path.
@@ -119,8 +118,7 @@ class Gap:
     """A piece of the area that no picture of the narrowest camera is sure to see.
 
     Attributes:
-        lat_deg, lon_deg: latitude and longitude of a point in it.
-        area_m2: its size, square metres.
+        lat_deg, lon_deg: latitude and longitude of a point in it. area_m2: its size, square metres.
     """
 
     lat_deg: float
@@ -134,18 +132,14 @@ class OverGround:
 
     Attributes:
         follows: legs keep a constant height above the ground; else all legs lie at one height.
-        by_vehicle: mission items are to state heights above the ground, which the vehicle keeps by a model of
-            its own.
-        nominal_m: height above the ground that was asked for.
-        least_m: lowest point of the legs.
-        most_m: highest.
-        way_least_m: lowest point of the flights but for takeoff and landing, above the highest ground up to
-            `beside_m` from it.
+        by_vehicle: mission items are to state heights above the ground, which the vehicle keeps by a model of its own.
+        nominal_m: height above the ground that was asked for. least_m, most_m: lowest and highest point of the legs.
+        way_least_m: lowest point of the flights but for takeoff and landing, above the highest ground up to `beside_m`
+            from it.
         top_m: highest point of the flights, above their takeoff.
         side_overlap: of neighbouring lines: the 5th percentile along the legs, and the median.
         forward_overlap: of consecutive pictures at the lowest point of the legs.
-        return_height_m: above takeoff, at which a straight way home passes over all ground and what stands on
-            it.
+        return_height_m: above takeoff, at which a straight way home passes over all ground and what stands on it.
     """
 
     follows: bool
@@ -197,19 +191,14 @@ class Plan:
         method: "columns", "bcd", "tmstc", or "lines" where a given polyline is followed.
         vehicles: what each vehicle flies, by number.
         altitude_m: height of the legs above takeoff, metres; above the ground where they follow it.
-        speed_m_s: planned ground speed, metres per second.
-        trigger_m: distance between pictures on a leg, metres.
+        speed_m_s: planned ground speed, metres per second. trigger_m: distance between pictures on a leg, metres.
         spacing_m: largest distance between neighbouring lines, metres.
-        footprint_m: width (across the leg) and height (along it) of the narrowest camera's picture on the
-            ground.
-        end: what a sortie does at last.
-        epsg: UTM grid in which the plan was made.
+        footprint_m: width (across the leg) and height (along it) of the narrowest camera's picture on the ground.
+        end: what a sortie does at last. epsg: UTM grid in which the plan was made.
         area_m2: size of the area, square metres; None along given lines.
         covered_share: share of the area that is seen for certain, 0 to 1; None along given lines.
-        gaps: what is missed, largest first.
-        separation: how vehicles are kept apart, in words.
-        warnings: what the user should know.
-        over_ground: how it lies over the height model, None without one.
+        gaps: what is missed, largest first. separation: how vehicles are kept apart, in words.
+        warnings: what the user should know. over_ground: how it lies over the height model, None without one.
         fences: geofences that vehicles are to hold while they fly it.
         apart: how far apart vehicles are at any time, horizontally or in height; None where that is not known.
         gimbal_pitch_deg: to which missions turn the gimbal, -90 straight down; None where they leave it alone.

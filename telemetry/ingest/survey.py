@@ -19,16 +19,12 @@ class LoadOptions:
     """Options for reading inputs.
 
     Attributes:
-        every_m: distance between pictures extracted from a video, metres; None for the default of
-            `picture_choice`.
-        every_s: seconds between them.
+        every_m: distance between pictures extracted from a video, metres; None for the default of `picture_choice`.
+        every_s: time between them, seconds.
         cache: folder for pictures extracted from videos; None makes one under the system's temporary folder.
-        exclude: files and folders that are left out (the output folder, for instance).
-        workers: threads that read.
-        camera: which sensor of cameras with several is mapped: wide, zoom or thermal; "" for the widest in
-            colour.
-        band: which spectral band of multispectral cameras is mapped; "" for colour, else the one that shows
-            most.
+        exclude: files and folders that are left out (the output folder, for instance). workers: threads that read.
+        camera: which sensor of cameras with several is mapped: wide, zoom or thermal; "" for the widest in colour.
+        band: which spectral band of multispectral cameras is mapped; "" for colour, else the one that shows most.
         decode: False to read only the metadata of videos, without extracting pictures (for `inspect`).
         run: maps a function over items in processes, for many photos; None: read in threads.
         sei_layouts: files that describe private SEI messages; see `telemetry.formats.video.sei`.
@@ -48,18 +44,24 @@ class LoadOptions:
 
 @dataclass(slots=True, kw_only=True)
 class SourceInfo:
-    """One source for `inspect`: a folder of photos, a video, a log or a table."""
+    """One source for `inspect`: a folder of photos, a video, a log or a table.
 
-    path: str  # relative to the inputs' root
-    kind: str  # "photos", "video", "geo.txt" and so on
-    counts: Counter[str] = field(default_factory=Counter)  # `frames`, `sei`, `klv`, `camera_events`
-    findings: list[Finding] = field(default_factory=list)  # what is suspicious about it
-    frames: list[Frame] = field(default_factory=list)  # the frames
-    # for sources without frames, the poses of each vehicle in order
+    Attributes:
+        path: relative to the inputs' root. kind: "photos", "video", "geo.txt" and so on.
+        counts: `frames`, `sei`, `klv`, `camera_events`. findings: what is suspicious about it. frames: the frames.
+        tracks: for sources without frames, the poses of each vehicle in order.
+        shown: number of pictures of each vehicle if it differs from the number of its frames.
+        sees: sensor and band of its pictures, as `Photo` has them.
+    """
+
+    path: str
+    kind: str
+    counts: Counter[str] = field(default_factory=Counter)
+    findings: list[Finding] = field(default_factory=list)
+    frames: list[Frame] = field(default_factory=list)
     tracks: dict[str, list[Sample]] = field(default_factory=dict)
-    # number of pictures of each vehicle if it differs from the number of its frames
     shown: dict[str, int] = field(default_factory=dict)
-    sees: tuple[str, str] = ("", "")  # sensor and band of its pictures, as `Photo` has them
+    sees: tuple[str, str] = ("", "")
 
 
 @dataclass(slots=True, kw_only=True)
