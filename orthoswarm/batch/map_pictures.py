@@ -27,6 +27,7 @@ from orthoswarm.mosaic.confidence import confidence, drawn_cells
 from orthoswarm.mosaic.extent import drawn_window, ground_level, placed_bounds
 from orthoswarm.mosaic.footprint import default_gsd, rejection
 from orthoswarm.mosaic.kernels.downsampling import reduction
+from orthoswarm.mosaic.key_pictures import key_pictures
 from orthoswarm.mosaic.oblique import stray_warning, strays, weakly_held_warning
 from orthoswarm.mosaic.radiometry import NO_MAP_TONE, estimate_fields, tone_warning
 from orthoswarm.mosaic.realtime import mosaic
@@ -53,7 +54,7 @@ def refined_pictures(run: RunContext, state: RunState, refinement: Refinement | 
         placed = _looking_down(run, state, state.recorded.placed)
         name = ORTHOIMAGE if run.options.until == "fine" else COARSE
         with run.clock.stage(f"final: {name.removesuffix('.tif')}", len(placed)):
-            stats = draw(run, name, placed, Terrain.flat(), state)
+            stats = draw(run, name, key_pictures(placed, 0.0, state.thumbnails), Terrain.flat(), state)
         if name == ORTHOIMAGE:
             _copy_coarse(run, state)
         state.drawn = stats.drawn
@@ -70,26 +71,29 @@ def refined_pictures(run: RunContext, state: RunState, refinement: Refinement | 
     if with_map and not on_map:
         state.warnings.append("no vehicle was found on the basemap; the orthoimage lies where the receivers say")
     fine = _looking_down(run, state, [p for s in refinement.fine for p in s.placed] + state.still)
-    coarse = [p for s in refinement.coarse for p in s.placed] + state.still
-    coarse = [p for p in coarse if p.frame.image not in state.rejected]
     state.warnings += weakly_held_warning(fine, state.odd)
+    level = ground_level(fine, terrain)
     if run.options.gsd_m is None:
-        state.gsd_m = default_gsd([p.camera for p in fine], ground_level(fine, terrain))
+        state.gsd_m = default_gsd([p.camera for p in fine], level)
     state.gsd_m *= coarser
+    shown = key_pictures(fine, level, state.thumbnails)
     if run.options.gains:
-        with run.clock.stage("final: gains", len(fine)):
+        with run.clock.stage("final: gains", len(shown)):
             tone = state.basemap if run.options.tone == "map" and with_map and on_map else None
             ground, threads = terrain or Terrain.flat(), run.drawers.count
-            state.gains = estimate_fields(fine, state.thumbnails, ground, tone=tone, threads=threads)
+            state.gains = estimate_fields(shown, state.thumbnails, ground, tone=tone, threads=threads)
         trim_memory()
         if run.options.tone == "map":
             state.warnings.append(tone_warning(state.gains) if tone else NO_MAP_TONE)
     if run.options.until != "fine":
-        _picture(run, state, COARSE, fine, terrain)
+        _picture(run, state, COARSE, shown, terrain)
     elif with_map:
-        _both(run, state, (coarse, _shared_terrain(refinement.coarse)), (fine, terrain))
+        names = {p.frame.image for p in shown}
+        coarse = [p for s in refinement.coarse for p in s.placed] + state.still
+        coarse = [p for p in coarse if p.frame.image in names]
+        _both(run, state, (coarse, _shared_terrain(refinement.coarse)), (shown, terrain))
     else:
-        _picture(run, state, ORTHOIMAGE, fine, terrain)
+        _picture(run, state, ORTHOIMAGE, shown, terrain)
         _copy_coarse(run, state)
     return [p for p in fine if p.frame.image not in state.rejected]
 

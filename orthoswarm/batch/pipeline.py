@@ -35,6 +35,7 @@ from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.model.task_runner import Progress
 from orthoswarm.mosaic.extent import partial_cover, placed_bounds
 from orthoswarm.mosaic.footprint import default_gsd
+from orthoswarm.mosaic.key_pictures import key_pictures
 from orthoswarm.mosaic.oblique import stray_warning, strays
 from orthoswarm.mosaic.recorded_pose import Recorded, area_grid, in_one_area, nothing_to_map, recorded_cameras
 from orthoswarm.mosaic.seams.previews import PreviewFile
@@ -222,7 +223,8 @@ def _realtime(run: RunContext, state: RunState) -> list[PlacedFrame]:
         run.clock.stages.append(stage)
     else:
         with run.clock.stage("realtime", len(placed)) as stage:
-            stats = map_pictures.draw(run, REALTIME, placed, Terrain.flat(), state, realtime=True)
+            shown = placed if run.options.until == "realtime" else key_pictures(placed, 0.0)
+            stats = map_pictures.draw(run, REALTIME, shown, Terrain.flat(), state, realtime=True)
         if not stats.pixels.any():
             reason = next(iter(stats.rejected.values()), "no picture sees the ground")
             raise OrthoSwarmError(f"no picture could be drawn: {reason}")

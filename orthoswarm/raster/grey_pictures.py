@@ -21,15 +21,13 @@ WORK_WIDTH_PX: Final = 960  # longer side of the pictures on which corners are f
 class GreyPictures:
     """Grey pictures as they were decoded first; what cannot be written is decoded again.
 
-    They have the refiner's working size, and come from the colours of that size, which are read for drawing a preview
-    anyhow. Any number of processes may use a store at the same time.
+    They have the refiner's working size, and come from the colours of that size where these are read for drawing. Any
+    number of processes may use a store at the same time.
 
-    folder: where the files are; an existing folder. from_colors: False to decode only the grey values, where colours
-    are read elsewhere.
+    folder: where the files are; an existing folder.
     """
 
     folder: Path
-    from_colors: bool = True
 
     @classmethod
     def create(cls, folder: Path, frames: Iterable[Frame], most_mb: float) -> "GreyPictures | None":
@@ -51,7 +49,7 @@ class GreyPictures:
         picture = read_rgb(path, max(longest, WORK_WIDTH_PX))
         height, width = picture.shape[:2]
         if reduction(width, height, WORK_WIDTH_PX) == 1 and path not in records(self.folder):
-            self._store(path, _luma(picture))
+            self._store(path, np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)))
         return picture
 
     def gray(self, frame: Frame) -> Bytes:
@@ -62,10 +60,7 @@ class GreyPictures:
         """
         picture = self._stored(frame.path)
         if picture is None:
-            if self.from_colors:
-                picture = _luma(read_rgb(frame.path, WORK_WIDTH_PX))
-            else:
-                picture = read_gray(frame.path, working_factor(frame))
+            picture = read_gray(frame.path, working_factor(frame))
             self._store(frame.path, picture)
         return picture
 
@@ -90,7 +85,3 @@ def stored_bytes(frames: Iterable[Frame]) -> int:
 def working_factor(frame: Frame) -> int:
     """By how much a picture is reduced for the refiner and the preview: 1, 2, 4 or 8."""
     return reduction(frame.width, frame.height, WORK_WIDTH_PX)
-
-
-def _luma(picture: Bytes) -> Bytes:
-    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY))

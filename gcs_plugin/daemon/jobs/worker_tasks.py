@@ -32,6 +32,8 @@ from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import GroundGrid, LocalGrid
 from orthoswarm.model.placement import Leg, PlacedFrame, Solution
+from orthoswarm.mosaic.extent import ground_level
+from orthoswarm.mosaic.key_pictures import key_pictures
 from orthoswarm.mosaic.oblique import stray_warning, strays
 from orthoswarm.mosaic.renderer import render
 from orthoswarm.raster.basemap import Basemap
@@ -156,7 +158,7 @@ def _options(task: SortieTask) -> "RefinerOptions":
     options = RefinerOptions(device=task.device)
     if task.kept is None:
         return options
-    return replace(options, read=GreyPictures(task.kept, from_colors=False).gray, kept=KeptTracks(task.kept))
+    return replace(options, read=GreyPictures(task.kept).gray, kept=KeptTracks(task.kept))
 
 
 def register_late(task: SortieTask) -> SortieResult:
@@ -340,7 +342,8 @@ def draw(task: DrawTask) -> dict[str, str]:
     terrain = read_solution(task.changed).terrain
     for path in task.solutions:
         sortie = read_solution(path)
-        for p in sortie.solution.placed:
+        shown = sortie.solution.placed
+        for p in key_pictures(shown, ground_level(shown, sortie.terrain)):
             if may_see(p, task.bounds):
                 frame = uniquely_named(p, len(placed), own=path == task.changed)
                 placed.append(frame)

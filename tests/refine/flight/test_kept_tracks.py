@@ -31,7 +31,7 @@ def scene(tmp_path_factory):
 @pytest.fixture
 def kept(tmp_path):
     """Options that keep tracks and decoded pictures."""
-    return RefinerOptions(read=GreyPictures(tmp_path, from_colors=False).gray, kept=KeptTracks(tmp_path))
+    return RefinerOptions(read=GreyPictures(tmp_path).gray, kept=KeptTracks(tmp_path))
 
 
 def refined(frames, basemap, options):
