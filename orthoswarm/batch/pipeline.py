@@ -28,9 +28,10 @@ from orthoswarm.evaluation.checkpoints import Checkpoint, read_checkpoints, shar
 from orthoswarm.evaluation.misread_points import require_places
 from orthoswarm.export.atomic_file import disk_error
 from orthoswarm.export.catalog.tiled_raster import product_file
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.frame import Frame, Ingest, Rejection
-from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.model.task_runner import Progress
 from orthoswarm.mosaic.extent import partial_cover, placed_bounds
@@ -46,6 +47,7 @@ from orthoswarm.raster.picture_file import read_gray, reduction
 from orthoswarm.raster.picture_parts import PictureParts
 from orthoswarm.refine.flight.record_findings import NAMED_MOST
 from orthoswarm.refine.flight.unsolved_pictures import hovering_vehicles
+from orthoswarm.refine.registration.photos_on_map import SearchedMap
 from orthoswarm.refine.strategy.unpositioned_photos import pictures_moved, place_unpositioned
 from orthoswarm.stores.addresses import address_of
 from orthoswarm.stores.listing import exists
@@ -53,6 +55,8 @@ from orthoswarm.trajectory.legs import split_legs
 
 _SPOT_DEG: Final = 0.001  # records farther apart than 110 m are none of a vehicle that hovers
 _QUICK_LOOK: Final = "a quick look at a quarter of the detail; the same command without --quick goes on from it"
+_MARKS: Final = "two control points, some way apart, must be seen in them"
+_NOT_FOUND: Final = "they were not found on the basemap within the radius of --near"
 _BESIDE_PHOTOS: Final = 15
 """Photos with a position before and after, of the same flight, that may show the ground of one without (its cost)."""
 
@@ -144,7 +148,8 @@ def _load(run: RunContext, load: Load) -> RunState:
         raise disk_error(error, run.out) from None
     ingest = without_false_spots(run, in_one_area(ingest))
     beside = bool(ingest.frames) and run.options.until != "realtime"  # photos that may tell where others were taken
-    if ingest.unpositioned and (beside or run.options.control is not None):
+    told = run.options.control is not None or run.options.near is not None
+    if ingest.unpositioned and (beside or told):
         ingest = with_found_positions(run, ingest)
     if not ingest.frames:
         raise nothing_to_map(ingest)
@@ -335,24 +340,31 @@ def _moved(run: RunContext, frames: Sequence[Frame]) -> bool:
 
 
 def with_found_positions(run: RunContext, ingest: Ingest) -> Ingest:
-    """Inputs with the photos without a position that the points of --control, or photos beside them, place.
+    """Inputs with the photos without a position that the points of --control, the basemap, or photos beside them place.
 
     Raises:
-        InputError: the points cannot be read, or a mark lies outside its photo.
+        InputError: the points or the basemap cannot be read, or a mark lies outside its photo.
+        OrthoSwarmError: there are no other photos, and the basemap does not show these.
     """
-    options = run.options
+    options, searched = run.options, None
     photos, positioned, points = ingest.unpositioned, ingest.frames, list[Checkpoint]()
     if options.control is not None:
         points = read_checkpoints(options.control, options.pixel_scale)
         require_places((point.name, point.surveyed) for point in points)
-    else:
+    if options.near is not None:
+        searched = _searched_map(options)
+    if not points and searched is None:
         photos, positioned = _beside(ingest)
-    tasks = run.workers.map
-    placed, left = place_unpositioned(photos, positioned, points, read_gray=_reduced, run=tasks, progress=run.progress)
+    placed, left = place_unpositioned(
+        photos, positioned, points, searched=searched, read_gray=_reduced, run=run.workers.map, progress=run.progress
+    )
+    if searched is not None and not placed and not ingest.frames:
+        raise OrthoSwarmError(f"{len(photos)} photos have no position, and {_NOT_FOUND}; give another place or radius")
     names = {frame.image for frame in placed}
-    by = "control points" if points else "the photos beside them"
+    by = "control points" if points else "the photos beside them" if searched is None else "the basemap"
     said = [f"{len(placed)} photos without a position were placed by {by}"] if placed else []
-    said += _left_out(len(photos) - len(placed), left) if points else []
+    if points or searched is not None:
+        said += _left_out(len(photos) - len(placed), left, _MARKS if searched is None else _NOT_FOUND)
     return replace(
         ingest,
         frames=_in_order([*ingest.frames, *placed], ingest),
@@ -362,11 +374,21 @@ def with_found_positions(run: RunContext, ingest: Ingest) -> Ingest:
     )
 
 
-def _left_out(count: int, blocks: list[list[str]]) -> list[str]:
-    """What is said about photos that control points could not place."""
+def _searched_map(options: MapOptions) -> SearchedMap:
+    """The part of the basemap in which photos without a position are looked for."""
+    assert options.near is not None and options.basemap is not None  # the command line has asked for both
+    lat, lon, radius_m = options.near
+    epsg = area_epsg([lat], [lon])
+    middle = LocalGrid(epsg).to_grid(lat, lon)
+    area = BoundingBox.around_points(middle, radius_m)
+    return SearchedMap(Basemap.open(options.basemap, epsg, area), middle, radius_m)
+
+
+def _left_out(count: int, blocks: list[list[str]], why: str) -> list[str]:
+    """What is said about photos that control points or the basemap could not place."""
     said = [
         f"{len(block)} photos without a position ({_first_of(block)}) show ground in common, but nothing tells where "
-        "it is: two control points, some way apart, must be seen in them; they are left out"
+        f"it is: {why}; they are left out"
         for block in blocks
     ]
     alone = count - sum(map(len, blocks))

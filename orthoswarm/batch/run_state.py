@@ -63,6 +63,8 @@ class MapOptions:
 
     Attributes:
         basemap: the pre-disaster map, None to stay in the receivers' frame.
+        near: latitude and longitude, degrees, and a radius, metres, within which photos without a position are looked
+            for on the basemap; None: they are not.
         refine: which refiner. until: the last stage to run.
         fov_min_deg: theta-hat, the assumed field of view of the real-time stage; None takes hints, else 70.
         gsd_m: ground pixel of the products; None for the median ground pixel at nadir.
@@ -80,6 +82,7 @@ class MapOptions:
     """
 
     basemap: Path | None = None
+    near: tuple[float, float, float] | None = None
     refine: RefinerName = "swarm"
     until: Literal["realtime", "coarse", "fine"] = "fine"
     fov_min_deg: float | None = None

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Final
 
 SURVEYED = "surveyed points"  # source (`Frame.origin`) of positions that control points gave
+ON_MAP = "the basemap"  # source of positions of photos that were found on the basemap
 BY_OTHERS = "photos beside it"  # source of positions that other photos of the same ground gave
 THETA_HAT_DEG: Final = 70.0
 """Horizontal field of view where nothing is known: below that of most drones' cameras (paper III.B)."""
@@ -86,7 +87,7 @@ class Frame:
     @property
     def has_own_position(self) -> bool:
         """Whether a receiver says its position, and not control points or other photos."""
-        return self.origin.get("position") not in (SURVEYED, BY_OTHERS)
+        return self.origin.get("position") not in (SURVEYED, ON_MAP, BY_OTHERS)
 
     def __deepcopy__(self, memo: dict[int, object]) -> "Frame":
         """Itself: nobody changes a frame."""

@@ -208,4 +208,7 @@ def nothing_to_map(ingest: Ingest) -> OrthoSwarmError:
     said = f"none of the {len(ingest.rejected)} pictures can be used; {count} of them: {reason}"
     if not ingest.unpositioned:
         return InputError(said)
-    return OrthoSwarmError(f"{said}, or mark at least two surveyed points in them (--control)")
+    return OrthoSwarmError(
+        f"{said}, mark at least two surveyed points in them (--control), "
+        "or say where they were taken, with a basemap (--near, --basemap)"
+    )

@@ -12,17 +12,25 @@ from tests.batch.test_control_run import survey
 from tests.kit.scene import Scene, legs
 
 
+def taken():
+    """Shots by vehicle and number, of two vehicles beside each other."""
+    return {
+        (vehicle, i): replace(s, north=s.north + 60.0 * k)
+        for k, vehicle in enumerate("ab")
+        for i, s in enumerate(legs(count=2, photos=8))
+    }
+
+
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory):
     """Two vehicles over one scene, and points that photos show: vehicle b recorded nothing, or neither did."""
     folder = tmp_path_factory.mktemp("unpositioned")
-    scene, shots = Scene(), {}
-    for k, vehicle in enumerate("ab"):
-        own = [replace(s, north=s.north + 60.0 * k) for s in legs(count=2, photos=8)]
+    scene, shots = Scene(), {f"{v}/DJI_{i:04d}.JPG": s for (v, i), s in taken().items()}
+    for vehicle in "ab":
+        own = [s for (v, _), s in taken().items() if v == vehicle]
         nothing = [replace(s, tags="none") for s in own]
         scene.fly(folder / "mixed" / vehicle, own if vehicle == "a" else nothing)
         scene.fly(folder / "bare" / vehicle, nothing)
-        shots |= {f"{vehicle}/DJI_{i:04d}.JPG": s for i, s in enumerate(own)}
     survey(folder / "control.csv", scene, shots, [(-60.0, -20.0), (55.0, 0.0), (0.0, 90.0), (-40.0, 60.0)])
     survey(folder / "check.csv", scene, shots, [(-30.0, 10.0), (40.0, 60.0), (20.0, -15.0), (-50.0, 85.0)])
     return folder
@@ -184,3 +192,41 @@ def test_photos_of_a_receiver_that_froze_are_placed_by_the_photos_beside_them(tm
     assert max(scene.error_m(rows[f"DJI_{k:04d}.JPG"], shots[k]) for k in range(11, 16)) < 3.0
     report = json.loads((out / "report.json").read_text())
     assert any("were placed by the photos beside them" in w for w in report["warnings"])
+
+
+def near(flight, lat, lon, radius_m=150):
+    return "--basemap", flight / "map.tif", "--near", f"{lat},{lon},{radius_m}"
+
+
+@pytest.mark.slow
+def test_photos_that_recorded_nothing_are_found_on_the_basemap_near_a_place(flight, tmp_path):
+    scene, out = Scene(), tmp_path / "out"
+    scene.basemap(flight / "map.tif")
+    assert mosaic(flight, "bare", out, *near(flight, scene.lat + 3e-4, scene.lon)) == 0
+    shots = {f"{vehicle}/DJI_{i:04d}.JPG": s for (vehicle, i), s in taken().items()}
+    rows = [json.loads(line) for line in (out / "frames.jsonl").read_text().splitlines()]
+    assert len(rows) == 32 and {row["stage"] for row in rows} == {"fine"}
+    assert np.median([scene.error_m(row, shots[row["image"]]) for row in rows]) < 0.3
+    report = json.loads((out / "report.json").read_text())
+    assert any("32 photos without a position were placed by the basemap" in w for w in report["warnings"])
+    assert not any("receivers say" in w for w in report["warnings"])
+
+
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        (("--near", "47.4,8.5"), "give one with --basemap"),
+        (("--near", "47.4"), "is not LAT,LON[,M]"),
+        (("--near", "947.4,8.5"), "latitude to 80"),
+    ],
+)
+def test_a_place_that_makes_no_sense_is_refused(flight, tmp_path, capsys, option, said):
+    assert mosaic(flight, "bare", tmp_path / "out", *option) == 2
+    assert said in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_photos_of_other_ground_are_not_found_on_a_basemap(flight, tmp_path, capsys):
+    other, out = Scene(seed=8), tmp_path / "out"
+    other.basemap(flight / "map.tif")
+    assert mosaic(flight, "bare", out, *near(flight, other.lat, other.lon)) == 1
+    assert "were not found on the basemap" in capsys.readouterr().err and not out.exists()

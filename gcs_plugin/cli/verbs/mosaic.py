@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from orthoswarm.model.frame import Ingest
     from orthoswarm.model.task_runner import Progress
 
+_NEAR_M = 300.0  # an area that people can name, and that is searched in a minute
 _REASONS = 5  # printed; all are in the report
 
 
@@ -31,6 +32,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("inputs", nargs="+", type=path_of, metavar="INPUT", help="folders of photos, photos, videos")
     add("--basemap", type=path_of, metavar="MAP", help="pre-disaster map: GeoTIFF, COG, MBTiles or folder z/x/y.png")
+    add(
+        "--near", type=_near, metavar="LAT,LON[,M]",
+        help=f"look for photos without a position on the basemap, within M metres of there (default {_NEAR_M:g})",
+    )  # fmt: skip
     add("--out", type=path_of, required=True, metavar="DIR", help="output folder; an interrupted run goes on there")
     refiners = ["swarm", "paper"] if find_spec("orthoswarm.paper") else ["swarm"]
     add("--refine", choices=refiners, default=refiners[0], help=f"how pictures are refined (default {refiners[0]})")
@@ -103,6 +108,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--cluster", metavar="URL", help="work on a Dask cluster, for example tcp://192.168.1.10:8786 (docs/cluster.md)"
     )
     add("--json", action="store_true", help="print the report as one JSON document on stdout")
+
+
+def _near(text: str) -> tuple[float, float, float]:
+    """Latitude, longitude and radius of --near."""
+    try:
+        lat, lon, radius_m = (float(part) for part in ([*text.split(","), str(_NEAR_M)])[:3])
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not LAT,LON[,M], for example 47.3977,8.5456,300") from None
+    if not (abs(lat) <= 80.0 and abs(lon) <= 180.0 and 10.0 <= radius_m <= 5000.0) or text.count(",") > 2:
+        raise argparse.ArgumentTypeError(f"{text!r}: latitude to 80, longitude to 180 degrees, 10 to 5,000 m around it")
+    return lat, lon, radius_m
 
 
 def run(args: argparse.Namespace) -> int:
@@ -240,6 +256,8 @@ def _check(args: argparse.Namespace) -> None:
             raise InputError(f"{flag} must be larger than zero; leave it out for the default")
     if args.workers is not None and args.workers < 1:
         raise InputError(f"--workers {args.workers} is too few; give 1 or more")
+    if args.near is not None and args.basemap is None:
+        raise InputError("--near says where on the basemap photos are looked for; give one with --basemap")
     if args.tone == "map":
         if args.basemap is None:
             raise InputError("--tone map takes brightness and hue from a basemap; give one with --basemap")

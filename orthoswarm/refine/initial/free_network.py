@@ -48,6 +48,10 @@ class Anchors:
         """Some of the observations."""
         return Anchors(**{name: getattr(self, name)[keep] for name in self.__slots__})
 
+    def joined(self, other: "Anchors") -> "Anchors":
+        """Both sets of observations."""
+        return Anchors(**{n: np.concatenate([getattr(self, n), getattr(other, n)]) for n in self.__slots__})
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FreeNetwork:

@@ -1,7 +1,8 @@
-"""Photos without a recorded position (kites, old cameras, lost tags), placed by surveyed points that they show.
+"""Photos without a recorded position (kites, old cameras, lost tags), placed by what they show.
 
-The pictures tell how the photos lie to each other (`free_network`), surveyed points and the positions of other photos
-where on the ground. The result is a position and heading with a sigma, as a receiver's, for the refiner to adjust.
+The pictures tell how the photos lie to each other (`free_network`); surveyed points, the basemap and the positions of
+other photos tell where on the ground. The result is a position and heading with a sigma, as a receiver's, for the
+refiner to adjust.
 """
 
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ from orthoswarm.evaluation.checkpoints import SURVEY_SIGMA_M, Checkpoint
 from orthoswarm.evaluation.photo_names import photo_named
 from orthoswarm.model.arrays import Array, Ints
 from orthoswarm.model.camera import angles_from_rotation
-from orthoswarm.model.frame import BY_OTHERS, SURVEYED, Frame
+from orthoswarm.model.frame import BY_OTHERS, ON_MAP, SURVEYED, Frame
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.task_runner import Progress, Run
 from orthoswarm.refine.features.working_pictures import ReadGray
@@ -24,7 +25,8 @@ from orthoswarm.refine.initial.initial_orientation import shape_of
 from orthoswarm.refine.initial.pair_graph import PairGraphBuilder
 from orthoswarm.refine.initial.planar_similarity import PhotoRecords, rotation_of
 from orthoswarm.refine.initial.relative_scale import focal_by_hint
-from orthoswarm.refine.initial.tilt_and_lens import PairMatches, TiltAndLens, level_pixels, similarities
+from orthoswarm.refine.initial.tilt_and_lens import PairMatches, TiltAndLens, level_pixels, similarities, spaced
+from orthoswarm.refine.registration.photos_on_map import FoundMarks, SearchedMap, marks_on_map
 
 _FREE_NADIR_SHARE: Final = 0.05
 """The ground straight below such a photo lies so far from where its level picture has it, sigma as a share of its
@@ -32,6 +34,8 @@ width: tilts of three degrees at a field of view of 60."""
 _FREE_MOST_PAIRS: Final = 40_000  # most pairs tried where nothing tells overlaps: 280 photos, two minutes of CPU
 
 
+_MAP_MOST_PHOTOS: Final = 60  # photos that are looked for on the basemap: a second of CPU each
+_MAP_MOST_MARKS: Final = 10  # places that each of those found gives to the network (chosen)
 _MOVED_SHARE: Final = 0.1
 """Pictures that shift by more of their width from one to the next were not taken at one spot: that is 14 % of the
 height or so, and vehicles count as hovering up to 5 %."""
@@ -51,19 +55,21 @@ def place_unpositioned(
     positioned: Sequence[Frame],
     points: Sequence[Checkpoint],
     *,
+    searched: SearchedMap | None = None,
     read_gray: ReadGray,
     run: Run,
     progress: Progress | None = None,
 ) -> PlacedPhotos:
-    """Give photos the positions and angles that surveyed points and other photos tell.
+    """Give photos the positions and angles that surveyed points, the basemap and other photos tell.
 
     photos: without positions (their latitude and longitude are NaN), of a vehicle in order of time. positioned: photos
     with positions, which may show the same ground. points: surveyed, with their marks in photos of either kind.
+    searched: where photos are looked for on the basemap.
     """
-    places = _known_places(positioned, points)
+    places = _known_places(positioned, points, searched)
     if not photos or not len(places):
         return PlacedPhotos([], [])
-    grid = LocalGrid(area_epsg(places[:, 0], places[:, 1]))
+    grid = LocalGrid(area_epsg(places[:, 0], places[:, 1]) if searched is None else searched.basemap.epsg)
     middle = places[int(np.argmin(((places - np.median(places, axis=0)) ** 2).sum(axis=1)))].tolist()
     origin = grid.to_grid(*middle)
     frames = [*(replace(f, fix=replace(f.fix, lat_deg=middle[0], lon_deg=middle[1])) for f in photos), *positioned]
@@ -78,11 +84,13 @@ def place_unpositioned(
     shape = shape_of(matches, records, *focal_by_hint(records))
     graph = similarities(matches, records, shape)
     anchors = _anchors(frames, records, points, grid=grid, origin=origin, known=len(photos))
+    if searched is not None:
+        anchors = anchors.joined(_map_anchors(photos, searched, origin, read_gray, progress))
     anchors = replace(anchors, pixel=level_pixels(anchors.pixel, anchors.photo, records, shape))
     network = solve_free_network(graph, len(frames), records.width, anchors)
     left = [[frames[k].image for k in part] for part in network.left]
     found = _placed(photos, network, records, shape, grid=grid, origin=origin)
-    source = SURVEYED if points else BY_OTHERS
+    source = SURVEYED if points else BY_OTHERS if searched is None else ON_MAP
     told = {"position": source, "height": source, "angles": source}
     return PlacedPhotos([replace(frame, origin={**frame.origin, **told}) for frame in found], left)
 
@@ -128,10 +136,11 @@ def candidate_pairs(without: int, count: int) -> Ints:
     return pairs.astype(np.int32)
 
 
-def _known_places(positioned: Sequence[Frame], points: Sequence[Checkpoint]) -> Array:
-    """Latitudes and longitudes (n, 2) of the photos with positions and of the surveyed points."""
+def _known_places(positioned: Sequence[Frame], points: Sequence[Checkpoint], searched: SearchedMap | None) -> Array:
+    """Latitudes and longitudes (n, 2) of the photos with positions, the surveyed points, and the searched area."""
     photos = [(f.fix.lat_deg, f.fix.lon_deg) for f in positioned]
-    return np.array([*photos, *((p.surveyed[1], p.surveyed[0]) for p in points)], float).reshape(-1, 2)
+    middle = [] if searched is None else [LocalGrid(searched.basemap.epsg).to_geographic(searched.middle)]
+    return np.array([*photos, *((p.surveyed[1], p.surveyed[0]) for p in points), *middle], float).reshape(-1, 2)
 
 
 def _anchors(
@@ -172,6 +181,31 @@ def _anchors(
         ground=np.array(ground_, np.complex128),
         sigma_m=np.array(sigma_m, float),
         sigma_px=np.array(sigma_px_, float),
+    )
+
+
+def _map_anchors(
+    photos: Sequence[Frame], searched: SearchedMap, origin: Array, read_gray: ReadGray, progress: Progress | None
+) -> Anchors:
+    """What the map shows of photos, evenly spread over all, that are found on it."""
+    some = spaced(len(photos), _MAP_MOST_PHOTOS).tolist()
+    grays = [read_gray(photos[k]) for k in some]
+    found, sigma_m = marks_on_map(grays, searched, progress)
+    photo, pixel, ground = [np.zeros(0, np.int32)], [np.zeros(0, complex)], [np.zeros(0, complex)]
+    for k, gray, marks in zip(some, grays, found, strict=True):
+        marks = FoundMarks(*(part[spaced(len(part), _MAP_MOST_MARKS)] for part in marks))
+        off = (marks.pixel - 0.5 * (np.array(gray.shape[::-1]) - 1)) * (photos[k].width / gray.shape[1])
+        photo.append(np.full(len(off), k, np.int32))
+        pixel.append(off[:, 0] - 1j * off[:, 1])
+        ground.append((marks.ground - origin) @ [1.0, 1j])
+    photo_ = np.concatenate(photo)
+    width = np.array([frame.width for frame in photos], float)
+    return Anchors(
+        photo=photo_,
+        pixel=np.concatenate(pixel),
+        ground=np.concatenate(ground),
+        sigma_m=np.full(len(photo_), sigma_m),
+        sigma_px=FREE_PAIR_SHARE * width[photo_],
     )
 
 
