@@ -13,10 +13,10 @@ import numpy as np
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.placement import PlacedFrame
 
-_CHANGE_SHARE: Final = 0.2
+_CHANGE_SHARE: Final = 0.12
 """Most by which the view changes from one key picture to the next, of the field of view along the shorter side
 (docs/benchmarks.md: error and cost by it)."""
-_USED_CHANGE_SHARE: Final = 0.25  # the same to a picture that is preferred: refined poses differ from recorded ones
+_USED_CHANGE_SHARE: Final = 0.15  # the same to a picture that is preferred: refined poses differ from recorded ones
 
 
 def key_pictures(placed: Sequence[PlacedFrame], ground_z_m: float, used: Collection[str] = ()) -> list[PlacedFrame]:

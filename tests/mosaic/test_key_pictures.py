@@ -31,12 +31,12 @@ def kept(placed, **how):
     return [k for k, p in enumerate(placed) if p.frame.image in chosen]
 
 
-def test_of_pictures_five_metres_apart_every_fourth_is_drawn():
-    assert kept(flown(np.arange(0, 101, 5))) == [0, 4, 8, 12, 16, 20]
+def test_of_pictures_that_overlap_by_nineteen_twentieths_every_second_is_drawn():
+    assert kept(flown(np.arange(0, 51, 6))) == [0, 2, 4, 6, 8]
 
 
-def test_pictures_that_overlap_by_seventy_percent_are_all_drawn():
-    assert kept(flown(np.arange(0, 400, 40))) == list(range(10))
+def test_pictures_that_overlap_by_four_fifths_are_all_drawn():
+    assert kept(flown(np.arange(0, 270, 27))) == list(range(10))
 
 
 def test_the_last_picture_before_a_gap_and_a_turn_on_the_spot_are_drawn():
@@ -50,7 +50,7 @@ def test_weak_and_damaged_pictures_stay_and_carry_nothing():
     placed = flown(np.arange(0, 41, 5))
     placed[4] = replace(placed[4], weak=True)
     placed[8] = replace(placed[8], frame=replace(placed[8].frame, damaged=True))
-    assert kept(placed) == [0, 3, 4, 7, 8]
+    assert kept(placed) == [0, 2, 3, 4, 5, 7, 8]
 
 
 def test_vehicles_do_not_stand_in_for_each_other():
@@ -77,4 +77,4 @@ def test_ground_that_any_picture_sees_is_seen_nearly_as_steeply(steps, seed):
     middles = 0.5 * (east[chosen][1:] + east[chosen][:-1])
     nearest = np.abs(middles[:, None] - east).min(1) if len(middles) else np.zeros(1)
     farthest = np.abs(middles[:, None] - east[chosen]).min(1) if len(middles) else np.zeros(1)
-    assert (farthest <= np.maximum(nearest, 12.0) + 1e-6).all()
+    assert (farthest <= np.maximum(nearest, 7.5) + 1e-6).all()
