@@ -23,6 +23,7 @@ from orthoswarm.model.errors import OrthoSwarmError
 # verb -> one line of help; its module in gcs_plugin.cli.verbs has configure(parser) and run(args) -> int.
 VERBS = {
     "plan": "make missions that cover an area, or follow lines, with a swarm",
+    "basemap": "fetch a map of an area from a tile server, for use without internet",
     "mosaic": "make a georeferenced orthoimage from drone photos",
     "coverage": "say which ground of an area was seen well, what was missed, and why",
     "change": "say where the ground is no longer what the pre-disaster map shows, and what has become of it",
@@ -39,7 +40,7 @@ VERBS = {
     "weights": "list, import and check the weights of learned matchers",
     "doctor": "show what this machine has (codecs, weights, cores, disk), and what does not work without the rest",
 }
-_FOLDERS = {"change": "ground.", "coverage": "ground."}
+_FOLDERS = dict.fromkeys(("basemap", "change", "coverage"), "ground.")
 """Where a verb's module lies, if not beside the others."""
 
 _NEGATIVE = re.compile(r"-[0-9.]")

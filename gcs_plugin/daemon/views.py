@@ -119,7 +119,8 @@ class Views:
         """The layers with versions and bounds, the basemap first, `best` last."""
         rows, basemap = [], self._tiles.basemap
         if basemap is not None:
-            rows.append(_layer_row("basemap", 1, basemap.epsg, basemap.bounds, basemap.native_gsd_m))
+            row = _layer_row("basemap", 1, basemap.epsg, basemap.bounds, basemap.native_gsd_m)
+            rows.append(row | {"attribution": basemap.attribution})
         shown: list[tuple[int, int | None, BoundingBox, float | None]] = []
         for name, layer in self._tiles.layers.items():
             with layer.reading() as canvas:

@@ -35,6 +35,7 @@ class MapServices:
         west, south, east, north = row["bounds"] or _WORLD
         return JsonAnswer({
             "tilejson": "3.0.0", "name": layer, "version": f"{row['version']}.0.0", "scheme": "xyz",
+            "attribution": row.get("attribution", ""),
             "tiles": [_tiles(request, layer, "{z}/{x}/{y}")], "minzoom": 0, "maxzoom": row["maxzoom"],
             "bounds": [west, south, east, north],
             "center": [0.5 * (west + east), 0.5 * (south + north), min(17, row["maxzoom"])],

@@ -64,6 +64,11 @@ class Basemap:
         return self._source.bounds
 
     @property
+    def attribution(self) -> str:
+        """Whose map it is and under which licence, as an MBTiles file says it; else empty."""
+        return self._source.attribution if isinstance(self._source, TileMap) else ""
+
+    @property
     def native_gsd_m(self) -> float:
         """Size of the map's own pixel on the ground of the area, metres."""
         return self._source.native_gsd_m

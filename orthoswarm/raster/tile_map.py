@@ -1,5 +1,6 @@
 """Map tiles in web Mercator, of a folder or an MBTiles file, read in windows on the area's grid."""
 
+import re
 import sqlite3
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -50,7 +51,7 @@ class TileMap:
     a server, tiles of one colour and half downloads are lacking.
 
     native_gsd_m: ground size of a pixel of that level, metres. bounds: west, south, east, north of the tiles near the
-    area, in its grid.
+    area, in its grid. attribution: whose they are, "" where nothing says it.
     """
 
     def __init__(self, path: Path, epsg: int, near: BoundingBox | None) -> None:
@@ -75,6 +76,7 @@ class TileMap:
         self.bounds = self._ground_bounds(around)
         x, y = (near or self.bounds).center
         self.native_gsd_m = self._pixel_m(x, y, self._zoom)
+        self.attribution = "" if isinstance(self._source, _Folder) else self._source.attribution()
 
     def _tile_size(self, places: Sequence[Place]) -> int:
         """Pixels of a tile's side, of the finest that can be decoded."""
@@ -347,6 +349,14 @@ class _Mbtiles:
             raise UnreadableMapError(
                 f"the basemap {self._path.name} cannot be read as a map; give a GeoTIFF, COG, MBTiles or XYZ folder"
             ) from None
+
+    def attribution(self) -> str:
+        """What the file says of its licence, without markup."""
+        try:
+            with self._query("SELECT value FROM metadata WHERE name = 'attribution'") as rows:
+                return re.sub(r"<[^>]*>", "", str((rows.fetchone() or ("",))[0]))
+        except UnreadableMapError:  # a file without metadata is a map, too
+            return ""
 
     def tiles(self, near: Ranges | None) -> dict[int, Tiles]:
         with self._query("SELECT zoom_level, min(tile_column), max(tile_column), min(tile_row), max(tile_row)"

@@ -74,7 +74,8 @@ subscribe("layers ready", "layers", () => {
       const line = rows.get(layer.name);
       if (!line) return;
       setAttribute(line.row, "data-empty", layer.empty ? "true" : "false");
-      setText(line.about, layer.empty ? t("layers.none") : t(`layers.${layer.name}.about`));
+      const about = layer.empty ? t("layers.none") : t(`layers.${layer.name}.about`);
+      setText(line.about, layer.attribution ? `${about} \u00b7 ${layer.attribution}` : about);
       setHidden(line.about, false);
     })();
   }
