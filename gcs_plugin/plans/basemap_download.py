@@ -20,6 +20,7 @@ import numpy as np
 
 from orthoswarm import __version__
 from orthoswarm.export.atomic_file import disk_error
+from orthoswarm.export.tiles.tile_pyramid import tile_of
 from orthoswarm.model.arrays import Array
 from orthoswarm.model.earth import DEGREE_M, WEB_MERCATOR_M
 from orthoswarm.model.errors import InputError, OrthoSwarmError
@@ -125,17 +126,10 @@ def download(
 def _places(zoom: int, west: float, south: float, east: float, north: float) -> Iterator[tuple[int, int, int]]:
     """Zoom, column and row from the north of the tiles over an area, the coarse ones first."""
     for z in range(max(0, zoom - _LEVELS + 1), zoom + 1):
-        left, right = (int((lon + 180.0) / 360.0 * 2**z) for lon in (west, east))
-        top, bottom = (_row(lat, z) for lat in (north, south))
+        (left, top), (right, bottom) = tile_of(west, north, z), tile_of(east, south, z)
         for row in range(top, bottom + 1):
             for column in range(left, right + 1):
                 yield z, column % 2**z, row
-
-
-def _row(lat: float, zoom: int) -> int:
-    share = 0.5 - math.asinh(math.tan(math.radians(lat))) / (2.0 * math.pi)
-    count = 1 << zoom
-    return min(max(int(share * count), 0), count - 1)
 
 
 def _begun(database: sqlite3.Connection, template: str) -> set[tuple[int, int, int]]:
@@ -239,8 +233,15 @@ def _kind(content: bytes) -> str | None:
 
 
 def grown(shells: Sequence[Array], margin_m: float) -> Array:
-    """South-west and north-east corner (2, 2) of areas (n, 2 each) with a margin: latitude and longitude in degrees."""
-    corners = np.array([np.concatenate(shells).min(0), np.concatenate(shells).max(0)])
+    """South-west and north-east corner (2, 2) of areas (n, 2 each) with a margin: latitude and longitude in degrees.
+
+    Longitudes go on beyond 180 for an area on both sides of it.
+    """
+    places = np.concatenate(shells)
+    east_of_first = (places[:, 1] - places[0, 1] + 180.0) % 360.0 - 180.0
+    places = np.column_stack([places[:, 0], places[0, 1] + east_of_first])
     north = margin_m / DEGREE_M
-    east = north / math.cos(math.radians(float(np.abs(corners[:, 0]).max())))
-    return np.asarray(corners + np.array([[-north, -east], [north, east]]))
+    margin = np.array([north, north / math.cos(math.radians(float(np.abs(places[:, 0]).max())))])
+    corners = np.stack([places.min(0) - margin, places.max(0) + margin])
+    corners[:, 1] += 360.0 if corners[0, 1] < -180.0 else 0.0
+    return corners

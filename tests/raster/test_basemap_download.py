@@ -12,6 +12,7 @@ import pytest
 
 from gcs_plugin.cli.main import main
 from gcs_plugin.plans import basemap_download
+from orthoswarm.export.tiles.tile_pyramid import tile_of
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.raster.basemap import Basemap
@@ -108,7 +109,7 @@ def test_the_file_is_a_basemap_and_says_whose_it_is(area, tmp_path, capsys):
     gray, valid = basemap.gray(around, 0.5)
     assert valid.mean() > 0.95
     lat, lon = grid.to_geographic(middle)
-    x, y = int((lon + 180) / 360 * 2**DEEPEST), basemap_download._row(lat, DEEPEST)
+    x, y = tile_of(lon, lat, DEEPEST)
     if (x + y) % 10:
         assert gray[496:504, 496:504].mean() == pytest.approx(shade(DEEPEST, x, y), abs=8)
 
@@ -147,3 +148,13 @@ def test_a_server_that_refuses_or_has_nothing_is_named(area, tmp_path, capsys):
         assert fetch(server.base + "/{z}/{x}/{y}.png", area, tmp_path / "a.mbtiles") == 1
         assert "refuses its tiles (403)" in capsys.readouterr().err
         assert fetch(server.base + "/{z}/{x}/{y}.txt/{-y}", area, tmp_path / "a.txt") == 2
+
+
+def test_an_area_across_the_date_line_is_fetched_from_both_sides(tmp_path):
+    ring = [[179.999, LAT], [-179.999, LAT], [-179.999, LAT + 0.002], [179.999, LAT + 0.002], [179.999, LAT]]
+    (tmp_path / "area.geojson").write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
+    with serving() as server:
+        out = tmp_path / "m.mbtiles"
+        assert fetch(server.base + "/{z}/{x}/{y}.png", tmp_path / "area.geojson", out, "--margin", 0) == 0
+        columns = {int(path.split("/")[2]) for path in server.asked if path.startswith(f"/{DEEPEST}/")}
+    assert {0, 2**DEEPEST - 1} <= columns and len(columns) < 8

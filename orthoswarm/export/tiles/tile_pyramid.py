@@ -238,8 +238,8 @@ def _pyramid(raster: Any) -> Pyramid:
     latitude = math.radians(0.5 * (south + north))
     zoom = math.ceil(math.log2(WEB_MERCATOR_M * math.cos(latitude) / SIDE / raster.res[0]) - 0.3)
     zoom = min(max(zoom, 0), _DEEPEST)
-    left, top = _tile_of(west, north, zoom)
-    right, bottom = _tile_of(east, south, zoom)
+    left, top = tile_of(west, north, zoom)
+    right, bottom = tile_of(east, south, zoom)
     levels = [TileRange(zoom, left, right, top, bottom)]
     coarsest = 1 if east > 180.0 else 0  # at zoom 0 both sides are in the same tile
     while levels[-1].count > 1 and levels[-1].zoom > coarsest:
@@ -247,7 +247,8 @@ def _pyramid(raster: Any) -> Pyramid:
     return Pyramid((west, south, east, north), tuple(levels))
 
 
-def _tile_of(lon: float, lat: float, zoom: int) -> tuple[int, int]:
+def tile_of(lon: float, lat: float, zoom: int) -> tuple[int, int]:
+    """Column, and row from the north, of the tile at a place in degrees; beyond 180 columns go on."""
     n = 2**zoom
     x, y = _tiles_from_north_west(lon, lat, zoom)
     most = 2 * n - 1 if lon > 180.0 else n - 1
