@@ -186,6 +186,7 @@ def _finished(
     }
     database.executemany("INSERT INTO metadata VALUES (?, ?)", rows.items())
     database.execute("DROP TABLE lacking")
+    database.execute("DELETE FROM metadata WHERE name = 'source'")  # whoever gets the file does not get the key in it
     database.commit()
     return Downloaded(tiles, lacking, last, 0.0)
 
