@@ -17,6 +17,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final, TypedDict
 
+import numpy as np
+
 from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage
 from gcs_plugin.daemon.intake.posted_pose import frame_of_row
 from gcs_plugin.daemon.jobs.job_queue import RunningJob
@@ -45,6 +47,7 @@ from orthoswarm.change.change_files import FIGURES, change_overlay, figures_in
 from orthoswarm.export.atomic_file import atomic_write, write_file
 from orthoswarm.export.tactical.cursor_on_target import TakAddress, TakSender, event
 from orthoswarm.export.tactical.places import Place, sightings
+from orthoswarm.model.camera import Camera
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.raster import picture_file
@@ -59,13 +62,17 @@ _log = logging.getLogger(__name__)
 
 
 class SightingRow(TypedDict, total=False):
-    """A picture that shows a place, and where in it (pixels); `seq`: its number."""
+    """A picture that shows a place, and where in it (pixels); `seq`: its number.
+
+    outline: longitude and latitude, degrees, of its four corners on the ground; null where one is above the horizon.
+    """
 
     vehicle: str
     image: str
     column: float
     row: float
     stage: str
+    outline: list[list[float]] | None
     seq: int | None
 
 
@@ -163,8 +170,12 @@ class Exports:
         find = next((row for row in self._console.finds() if row["id"] == number), None)
         if find is None:
             raise InputError(f"there is no find {number}; see /api/finds")
+        return self.pictures_of(find["lat_deg"], find["lon_deg"])
+
+    def pictures_of(self, lat_deg: float, lon_deg: float) -> list[SightingRow]:
+        """The pictures that show a place, best first; see `pictures_at`. Each has its `seq`."""
         area = self._drawer.area
-        rows = [] if area is None else pictures_at(self._task(area), find["lat_deg"], find["lon_deg"])
+        rows = [] if area is None else pictures_at(self._task(area), lat_deg, lon_deg)
         for row in rows:
             row["seq"] = frame_number(self._journal, row["vehicle"], row["image"])
         return rows
@@ -245,14 +256,20 @@ def _name(find: FindRow) -> str:
 
 
 def pictures_at(task: ExportTask, lat_deg: float, lon_deg: float) -> list[SightingRow]:
-    """The pictures that show a place, best first, as JSON values: `vehicle`, `image`, `column`, `row`, `stage`."""
+    """The pictures that show a place, best first, as JSON values, see `SightingRow`."""
     solutions = [read_solution(path).solution for path in (*task.coarse, *task.solutions)]
     placed, level = placements(task, solutions)
-    east, north = (float(v) for v in LocalGrid(task.epsg).to_grid(lat_deg, lon_deg))
+    grid = LocalGrid(task.epsg)
+    east, north = (float(v) for v in grid.to_grid(lat_deg, lon_deg))
+
+    def outline(camera: Camera) -> list[list[float]] | None:
+        corners = camera.corners(level)
+        return grid.to_geographic(corners)[:, ::-1].tolist() if np.isfinite(corners).all() else None
+
     return [
         {
             "vehicle": s.placed.frame.vehicle, "image": s.placed.frame.image, "column": round(s.column, 1),
-            "row": round(s.row, 1), "stage": s.placed.stage,
+            "row": round(s.row, 1), "stage": s.placed.stage, "outline": outline(s.placed.camera),
         }
         for s in sightings(placed, (east, north, level))[:_MOST_SIGHTINGS]
     ]  # fmt: skip

@@ -289,8 +289,14 @@ class HttpRoutes:
         return Response(status_code=204)
 
     async def find_pictures(self, number: int) -> Response:
-        """The pictures that show a find, best first: `seq`, `vehicle`, `image`, `column`, `row`, `stage`."""
+        """The pictures that show a find, best first, see `SightingRow`."""
         return JsonAnswer(await self.work(self.daemon.exports.find_pictures, number))
+
+    async def place_pictures(
+        self, lat_deg: float = Query(ge=-90.0, le=90.0), lon_deg: float = Query(ge=-180.0, le=180.0)
+    ) -> Response:
+        """The pictures that show a place, best first, see `SightingRow`."""
+        return JsonAnswer(await self.work(self.daemon.exports.pictures_of, lat_deg, lon_deg))
 
     async def picture(self, seq: int) -> Response:
         """A picture as received; `seq` is its number in /api/frames."""
@@ -380,6 +386,7 @@ def make_app(daemon: Daemon, access: Access, address: str = "") -> Any:
     add("/api/areas", read_area, methods=["POST"])
     add("/api/plan", routes.console_plan)
     add("/api/finds/{number}/pictures", routes.find_pictures)
+    add("/api/pictures", routes.place_pictures)
     add("/api/frames/{seq}/picture", routes.picture)
     add("/api/frames/{seq}/view", routes.picture_view)
     add("/api/places", routes.places)

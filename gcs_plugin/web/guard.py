@@ -55,7 +55,7 @@ _READING: Final = """
     /api/vehicles /api/layers /api/jobs /api/legs
     /api/completions /api/frames /api/routes /api/frames/{seq}/picture /api/frames/{seq}/view /api/plans
     /api/plans/{number}/map /api/plans/{number}/files/{drone} /api/plan /api/traffic /api/finds
-    /api/finds/{number}/pictures /api/places /api/trust /api/trust.png /api/change /api/change.png
+    /api/finds/{number}/pictures /api/pictures /api/places /api/trust /api/trust.png /api/change /api/change.png
     /api/coverage /api/coverage/gaps.geojson /api/coverage/cells.png /api/coverage/vehicles
     /api/export/{job}/{kind} /api/holds /api/log
 """

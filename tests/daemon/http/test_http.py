@@ -79,6 +79,21 @@ def test_pictures_of_ten_bits_are_not_dark_on_the_map_and_in_the_view(served):
     assert served.get("/api/frames/999999/view").status_code == 422
 
 
+def test_pictures_of_a_place_are_named_with_their_outlines(served):
+    shots = line(3, "looked", east=1500)
+    for shot in shots:
+        assert served.send(shot).status_code == 201
+    rows = served.until("/api/frames?vehicle=looked", lambda rows: all(row["on_map"] for row in rows))
+    pose = shots[1].pose
+    found = served.get(f"/api/pictures?lat_deg={pose['lat_deg']}&lon_deg={pose['lon_deg']}").json()
+    assert found[0]["image"] == pose["image"] and {row["vehicle"] for row in found} == {"looked"}
+    assert {row["seq"] for row in found} <= {row["seq"] for row in rows}
+    lon, lat = np.array(found[0]["outline"]).T
+    assert len(lon) == 4 and lon.min() < pose["lon_deg"] < lon.max() and lat.min() < pose["lat_deg"] < lat.max()
+    assert served.get("/api/pictures?lat_deg=0&lon_deg=0").json() == []
+    assert served.get("/api/pictures?lat_deg=north&lon_deg=0").status_code == 422
+
+
 def test_a_picture_that_browsers_show_is_viewed_unchanged(served):
     shot = line(1, "viewed")[0]
     assert served.send(shot).status_code == 201

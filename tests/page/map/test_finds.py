@@ -19,7 +19,8 @@ def test_pictures_of_a_find_leave_commands_and_alarms_in_reach(browser):
         "note": "Roof",
         "time": "2026-05-28T20:26:40Z",
     }
-    one = {"seq": 5, "vehicle": "v1", "column": 0.5, "row": 0.25, "stage": "fine"}
+    ring = [[8.545, 47.398], [8.546, 47.398], [8.546, 47.397], [8.545, 47.397]]
+    one = {"seq": 5, "vehicle": "v1", "column": 0.5, "row": 0.25, "stage": "fine", "outline": ring}
     shown = [one | {"image": f"{name}.jpg"} for name in "abcdefghijkl"]  # more than the box can show at once
     for size in (DESK, PHONE):
         with standing(vehicle(1, name="Falcon")) as station:
@@ -31,6 +32,10 @@ def test_pictures_of_a_find_leave_commands_and_alarms_in_reach(browser):
                 page.click(".finds >> text=Pictures")
                 page.wait_for_selector(".pictures figcaption:has-text('a.jpg of Falcon')")
                 page.wait_for_function("() => document.querySelector('.pictures i').style.left === '50%'")
+                page.hover(".pictures figure >> nth=0")
+                page.wait_for_function(
+                    "() => window.orthoswarm.map.getSource('sighting')?.serialize().data.features.length === 1"
+                )
                 near = {"type": "vehicle_event", "kind": "near", "vehicle": "v1", "pair": ["v1", "v2"], "text": "near"}
                 send(page, near)
                 page.click(".alarms >> text=Seen")  # fails if the pictures lie over the alarms
@@ -41,6 +46,29 @@ def test_pictures_of_a_find_leave_commands_and_alarms_in_reach(browser):
                 page.focus(".find-pictures button")
                 page.keyboard.press("Escape")
                 page.wait_for_selector(".find-pictures", state="hidden")
+                page.wait_for_function(
+                    "() => window.orthoswarm.map.getSource('sighting').serialize().data.features.length === 0"
+                )
+
+
+def test_pictures_of_any_place_can_be_looked_at(browser):
+    with standing(vehicle(1, name="Falcon")) as station, opened(browser, station.url) as page:
+        one = {
+            "seq": 5,
+            "vehicle": "v1",
+            "image": "a.jpg",
+            "column": 0.5,
+            "row": 0.25,
+            "stage": "fine",
+            "outline": None,
+        }
+        station.gets["/api/pictures"] = [one]
+        page.route("**/api/frames/5/view*", lambda route: route.fulfill(body=PNG, content_type="image/png"))
+        page.click("#tab-map")
+        page.click("button:has-text('Pictures of a place')")
+        with page.expect_request(lambda request: "/api/pictures?lat_deg=47." in request.url):
+            page.mouse.click(900, 400)
+        page.wait_for_selector(".pictures figcaption:has-text('a.jpg of Falcon')")
 
 
 def test_the_ground_under_a_vehicle_can_be_marked(browser):

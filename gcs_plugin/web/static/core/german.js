@@ -220,7 +220,7 @@ export const german = {
   "finds.move": "Verschieben", "finds.moved": "Neue Stelle gesetzt", "finds.save": "Speichern",
   "finds.elsewhere": "Diese Markierung wurde inzwischen auf einer anderen Seite geändert, siehe Liste. Erneut speichern ersetzt das durch die eigene, oder abbrechen.",
   "finds.gone": "{note} wurde auf einer anderen Seite entfernt.", "finds.marker": "Markierung: {note}",
-  "finds.pictures": "Bilder", "finds.pictures.of": "Bilder, die {note} zeigen", "finds.pictures.none": "Kein Bild zeigt die Stelle.",
+  "finds.pictures": "Bilder", "finds.pictures.of": "Bilder, die {note} zeigen", "finds.pictures.here": "Bilder einer Stelle", "finds.pictures.none": "Kein Bild zeigt die Stelle.",
   "finds.pictures.one": "{image} von {name}", "finds.pictures.close": "Schließen",
   "finds.absent": "Diese Bodenstation speichert keine Markierungen; sie aktualisieren.", "finds.failed": "{note} wurde nicht gespeichert: {why}",
   "finds.retry": "Erneut speichern", "finds.removed": "{note} wurde entfernt.", "finds.restore": "Zurückholen",

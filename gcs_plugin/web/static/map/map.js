@@ -44,6 +44,8 @@ const OVERLAYS = [
   ["routes-ways", "symbol", {}, ["==", ["get", "part"], "left"], "routes", { "symbol-placement": "line", "symbol-spacing": 120, "icon-image": "way", "icon-overlap": "never", "icon-padding": 20 }],
   ["waypoints", "circle", { "circle-radius": 7, "circle-color": "transparent", "circle-stroke-width": 3, "circle-stroke-color": COLOUR }],
   ["homes", "circle", { "circle-radius": 6, "circle-color": "#fff", "circle-stroke-width": 3, "circle-stroke-color": COLOUR }],
+  ["sighting-edge", "line", { "line-color": "#000", "line-width": 5, "line-opacity": 0.6 }, null, "sighting"],
+  ["sighting", "line", { "line-color": "#ff7ac3", "line-width": 3 }],
   ["ellipses", "fill", { "fill-color": "#d6409f", "fill-opacity": 0.2, "fill-outline-color": "#d6409f" }],
   ["measure-area", "fill", { "fill-color": "#ffd43b", "fill-opacity": 0.25 }, null, "measure"],
   ["measure-edge", "line", { "line-color": "#000", "line-width": 5, "line-opacity": 0.6 }, null, "measure"],

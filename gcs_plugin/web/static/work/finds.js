@@ -110,14 +110,20 @@ export function findPanel() {
   const edit = editor();
   const note = make("input", { type: "text", maxlength: 200, placeholder: t("finds.note"), "aria-label": t("finds.note") });
   const mark = button(t("finds.mark"), () => (tool.active === "find" ? stop() : begin()));
+  const look = button(t("finds.pictures.here"), () => (tool.active === "pictures" ? away() : (takeTool("pictures", away), setText(look, t("finds.tap")))));
+  function away() { dropTool("pictures"); setText(look, t("finds.pictures.here")); }
   const list = make("ul", { class: "finds" });
   const about = make("p", { class: "quiet", role: "status" });
   const begin = () => { takeTool("find", stop); setText(mark, t("finds.tap")); };
   function stop() { dropTool("find"); setText(mark, t("finds.mark")); }
   map.on("click", async (event) => {
+    const { lng, lat } = event.lngLat.wrap();
+    if (tool.active === "pictures") {
+      away();
+      await showPictures({ lat_deg: lat, lon_deg: lng });
+    }
     if (tool.active !== "find") return;
     stop();
-    const { lng, lat } = event.lngLat.wrap();
     const words = note.value.trim();
     note.value = "";
     await save({ lat_deg: lat, lon_deg: lng, sigma_m: sigmaAt(lng, lat), note: words });
@@ -140,5 +146,5 @@ export function findPanel() {
       setAttribute(marker.getElement(), "aria-label", t("finds.marker", { note: name }));
     }
   });
-  return make("section", {}, make("h2", {}, t("finds.title")), make("div", { class: "row wrap" }, note, mark), about, list);
+  return make("section", {}, make("h2", {}, t("finds.title")), make("div", { class: "row wrap" }, note, mark, look), about, list);
 }
