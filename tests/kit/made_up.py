@@ -41,13 +41,17 @@ def complete(daemon, vehicle="v1"):
     daemon.jobs.wake()
 
 
-def after_job(daemon, count):
-    """Wait until so many refinements have ended and nothing is left to do; gives the refinements."""
+def after_job(daemon, count, *, last="refine"):
+    """Wait until so many refinements, and a job of the last kind, have ended, and nothing is left to do.
+
+    What a job leads to is asked for after its end: between the two nothing is open. Gives the refinements.
+    """
     end = time.monotonic() + LIMIT_S
     while True:
         everything = daemon.jobs.all()
         jobs = [job for job in everything if job.kind == "refine"]
-        if len(jobs) >= count and not daemon.jobs.open() and all(job.ended for job in everything):
+        there = len(jobs) >= count and any(job.kind == last for job in everything)
+        if there and not daemon.jobs.open() and all(job.ended for job in everything):
             return jobs
         assert time.monotonic() < end, [job.document() for job in daemon.jobs.all()]
         time.sleep(0.05)

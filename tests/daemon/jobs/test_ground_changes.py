@@ -26,7 +26,7 @@ def test_a_refinement_on_the_basemap_is_compared_with_it(tmp_path):
         assert daemon.changes.document()["version"] == 0 and daemon.changes.picture(0.5) is None
         post(daemon, frames)
         complete(daemon, "v1")
-        after_job(daemon, 1)
+        after_job(daemon, 1, last="change")
         jobs = daemon.jobs.all()
         compared = [job for job in jobs if job.kind == "change"]
         assert compared and all(job.state == "done" for job in compared), [job.message for job in compared]
