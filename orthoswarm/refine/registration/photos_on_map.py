@@ -30,6 +30,8 @@ _RATIO: Final = 0.85  # nearest over second nearest descriptor's distance at mos
 _AGREE_PX: Final = (
     6.0  # matches within so many map pixels of a similarity agree with it: photos are tilted, houses stand
 )
+_FEWEST: Final = 8
+"""Fewest matches that agree: houses that are alike let 5 or 6 agree by chance on a map whose detail is another one."""
 _LEAST_WIDTH_PX: Final = 60.0  # a photo covers at least so many pixels of the map: else one spot matches everything
 _RANSAC_ROUNDS: Final = 20_000  # finds ten of 250 matches that agree in 19 of 20 photos (chosen)
 _AT_ONCE: Final = 64  # descriptors that are compared at once with all of the map (memory)
@@ -141,7 +143,7 @@ def _agreeing(pixel: Array, spot: Array, width_px: int, reach_px: float) -> Indi
     similarity, inlier = cv2.estimateAffinePartial2D(
         pixel, spot, ransacReprojThreshold=_AGREE_PX, maxIters=_RANSAC_ROUNDS, confidence=0.9999
     )
-    if similarity is None or np.hypot(*similarity[:, 0]) * width_px < _LEAST_WIDTH_PX:
+    if similarity is None or inlier.sum() < _FEWEST or np.hypot(*similarity[:, 0]) * width_px < _LEAST_WIDTH_PX:
         return nothing
     agree = np.flatnonzero(inlier)
     chance = agreement_probability(len(agree) - 2, len(pixel) - 2, _AGREE_PX, reach_px)
