@@ -146,5 +146,5 @@ export function findPanel() {
       setAttribute(marker.getElement(), "aria-label", t("finds.marker", { note: name }));
     }
   });
-  return make("section", {}, make("h2", {}, t("finds.title")), make("div", { class: "row wrap" }, note, mark, look), about, list);
+  return make("section", {}, make("h2", {}, t("finds.title")), make("div", { class: "row wrap" }, note, mark), make("div", { class: "row" }, look), about, list);
 }
