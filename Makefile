@@ -36,9 +36,9 @@ check: kernels $(DEV)
 	@$(BIN)/lint-imports
 
 # What a user needs, at the versions of the lock, without what packages bring for their own tests and for C++ (0.3 GB).
+# Python compiles of it what is imported, when it is first imported: all of it takes 25 s and 0.3 GB.
 # What modules with kernels import comes first: these are compiled while the rest, PyTorch above all, is installed.
 KERNELS_NEED = numba numpy opencv-python-headless scipy pyproj rasterio shapely simplejpeg pillow isal
-# Python compiles of it what is imported, when it is first imported: all of it takes 25 s and 0.3 GB.
 $(USER): requirements.lock pyproject.toml
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer was not found; install it, or say make PYTHON=/path/to/python3"; exit 1; }
 	@echo "making the environment $(VENV) with $(PYTHON) (a minute, once)"

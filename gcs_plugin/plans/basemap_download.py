@@ -20,6 +20,7 @@ import numpy as np
 
 from orthoswarm import __version__
 from orthoswarm.export.atomic_file import disk_error
+from orthoswarm.export.tiles.mbtiles import TABLES
 from orthoswarm.export.tiles.tile_pyramid import tile_of
 from orthoswarm.model.arrays import Array
 from orthoswarm.model.earth import DEGREE_M, WEB_MERCATOR_M
@@ -34,13 +35,7 @@ _TIMEOUT_S: Final = 20.0
 _LEVELS: Final = 6  # zoom levels at most: the coarser ones are for looking at the whole
 _DEEPEST: Final = 22  # zoom, of servers that do not say theirs
 _SIGNATURES: Final = {b"\x89PNG": "png", b"\xff\xd8\xff": "jpg", b"RIFF": "webp"}
-_TABLES: Final = (
-    "PRAGMA application_id=1297105496;"
-    "CREATE TABLE IF NOT EXISTS metadata (name text, value text);"
-    "CREATE TABLE IF NOT EXISTS tiles (zoom_level integer, tile_column integer, tile_row integer, tile_data blob);"
-    "CREATE UNIQUE INDEX IF NOT EXISTS tile_index ON tiles (zoom_level, tile_column, tile_row);"
-    "CREATE TABLE IF NOT EXISTS lacking (zoom_level integer, tile_column integer, tile_row integer);"
-)
+_LACKING: Final = "CREATE TABLE IF NOT EXISTS lacking (zoom_level integer, tile_column integer, tile_row integer);"
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,8 +106,8 @@ def download(
         with closing(sqlite3.connect(part)) as database:
             there = _begun(database, server.template)
             _fetch_all(server, [place for place in places if place not in there], database, len(places), progress)
-            found = _finished(database, path.stem, server.attribution, (west, south, east, north))
-        if not found.tiles:
+            tiles, lacking, zoom = _finished(database, path.stem, server.attribution, (west, south, east, north))
+        if not tiles:
             part.unlink()
             raise InputError("the server has no tile of this area; check the address and the area")
         part.replace(path)
@@ -120,7 +115,7 @@ def download(
         raise OrthoSwarmError(f"{part} cannot be written ({error}); free some disk space and run again") from None
     except OSError as error:
         raise disk_error(error, path) from None
-    return Downloaded(found.tiles, found.lacking, found.zoom, WEB_MERCATOR_M * across / 256 / 2**found.zoom)
+    return Downloaded(tiles, lacking, zoom, WEB_MERCATOR_M * across / 256 / 2**zoom)
 
 
 def _places(zoom: int, west: float, south: float, east: float, north: float) -> Iterator[tuple[int, int, int]]:
@@ -134,7 +129,7 @@ def _places(zoom: int, west: float, south: float, east: float, north: float) -> 
 
 def _begun(database: sqlite3.Connection, template: str) -> set[tuple[int, int, int]]:
     """The file's tables, and the places that an earlier run asked for at the same server."""
-    database.executescript(_TABLES)
+    database.executescript(TABLES + _LACKING)
     if database.execute("SELECT value FROM metadata WHERE name = 'source'").fetchone() != (template,):
         database.executescript("DELETE FROM tiles; DELETE FROM lacking; DELETE FROM metadata;")
         database.execute("INSERT INTO metadata VALUES ('source', ?)", (template,))
@@ -168,11 +163,11 @@ def _fetch_all(
 
 def _finished(
     database: sqlite3.Connection, name: str, attribution: str, bounds: tuple[float, float, float, float]
-) -> Downloaded:
-    """Write what viewers ask for."""
+) -> tuple[int, int, int]:
+    """Write what viewers ask for; how many tiles there are and are lacking, and the deepest zoom."""
     tiles, first, last = database.execute("SELECT count(*), min(zoom_level), max(zoom_level) FROM tiles").fetchone()
     if not tiles:
-        return Downloaded(0, 0, 0, 0.0)
+        return 0, 0, 0
     lacking = database.execute("SELECT count(*) FROM lacking WHERE zoom_level = ?", (last,)).fetchone()[0]
     some = bytes(database.execute("SELECT tile_data FROM tiles LIMIT 1").fetchone()[0])
     rows = {
@@ -188,7 +183,7 @@ def _finished(
     database.execute("DROP TABLE lacking")
     database.execute("DELETE FROM metadata WHERE name = 'source'")  # whoever gets the file does not get the key in it
     database.commit()
-    return Downloaded(tiles, lacking, last, 0.0)
+    return tiles, lacking, last
 
 
 def _tile(template: str, z: int, x: int, y: int) -> bytes | None:

@@ -353,7 +353,7 @@ def with_found_positions(run: RunContext, ingest: Ingest) -> Ingest:
         require_places((point.name, point.surveyed) for point in points)
     if options.near is not None:
         searched = _searched_map(options)
-    if not points and searched is None:
+    if options.control is None and searched is None:
         photos, positioned = _beside(ingest)
     placed, left = place_unpositioned(
         photos, positioned, points, searched=searched, read_gray=_reduced, run=run.workers.map, progress=run.progress

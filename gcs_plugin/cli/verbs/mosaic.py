@@ -113,7 +113,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def _near(text: str) -> tuple[float, float, float]:
     """Latitude, longitude and radius of --near."""
     try:
-        lat, lon, radius_m = (float(part) for part in ([*text.split(","), str(_NEAR_M)])[:3])
+        lat, lon, radius_m = (float(part) for part in [*text.split(","), str(_NEAR_M)][:3])
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not LAT,LON[,M], for example 47.3977,8.5456,300") from None
     if not (abs(lat) <= 80.0 and abs(lon) <= 180.0 and 10.0 <= radius_m <= 5000.0) or text.count(",") > 2:

@@ -18,12 +18,14 @@ from orthoswarm.model.errors import InputError
 
 Format = Literal["png", "webp", "jpg"]
 Tile = tuple[int, int, bytes]
-_TABLES: Final = (
-    "PRAGMA journal_mode=OFF; PRAGMA synchronous=OFF; PRAGMA application_id=1297105496;"
-    "CREATE TABLE metadata (name text, value text);"
-    "CREATE TABLE tiles (zoom_level integer, tile_column integer, tile_row integer, tile_data blob);"
-    "CREATE UNIQUE INDEX tile_index ON tiles (zoom_level, tile_column, tile_row);"
+TABLES: Final = (
+    "PRAGMA application_id=1297105496;"
+    "CREATE TABLE IF NOT EXISTS metadata (name text, value text);"
+    "CREATE TABLE IF NOT EXISTS tiles (zoom_level integer, tile_column integer, tile_row integer, tile_data blob);"
+    "CREATE UNIQUE INDEX IF NOT EXISTS tile_index ON tiles (zoom_level, tile_column, tile_row);"
 )
+"""What makes a database an MBTiles file."""
+_AT_ONCE: Final = "PRAGMA journal_mode=OFF; PRAGMA synchronous=OFF;"  # of a file that is written in one go
 _FORMATS: Final = {"png": "PNG", "jpg": "JPEG", "webp": "WEBP"}
 _TILE: Final = "SELECT tile_data FROM tiles WHERE zoom_level = ? AND tile_column = ? AND tile_row = ?"
 
@@ -73,7 +75,7 @@ class MbtilesFile:
 
     def begin(self, pyramid: Pyramid) -> None:
         """Write the metadata."""
-        self._database.executescript(_TABLES)
+        self._database.executescript(_AT_ONCE + TABLES)
         west, south, east, north = pyramid.bounds
         finest, middle = pyramid.finest.zoom, (west + east) / 2
         bounds = pyramid.whole_pixel_bounds()

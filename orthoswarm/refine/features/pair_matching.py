@@ -102,12 +102,16 @@ def _epipolar_inliers(p: Floats, q: Floats) -> Flags:
     return np.zeros(len(p), bool) if inliers is None else np.asarray(inliers[:, 0] > 0)
 
 
-@lru_cache(maxsize=64)
-def _root_sift(features: SiftFeatures) -> Floats:
+def root_sift(descriptor: NDArray[np.generic]) -> Floats:
     """Unit vectors float32 (n, 128) whose dot product compares SIFT descriptors by the Hellinger kernel."""
-    d = features.descriptor.astype(np.float32)
+    d = descriptor.astype(np.float32)
     d /= np.maximum(d.sum(axis=1, keepdims=True), 1.0)
     return np.asarray(np.sqrt(d, out=d))
+
+
+@lru_cache(maxsize=64)
+def _root_sift(features: SiftFeatures) -> Floats:
+    return root_sift(features.descriptor)
 
 
 def consecutive(group: NDArray[np.integer], time_s: Array) -> Ints:

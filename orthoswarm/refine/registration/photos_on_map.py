@@ -18,6 +18,7 @@ from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.model.task_runner import Progress
+from orthoswarm.refine.features.pair_matching import root_sift
 from orthoswarm.refine.registration.map_evidence import FALSE_MATCHES, agreement_probability
 
 _MAP_SIDE_PX: Final = 4000  # longer side of the searched map at most (its features take a minute and 80 MB)
@@ -27,9 +28,8 @@ _PART_PX: Final = 1000  # side of the parts of a map whose features are found at
 _PART_MARGIN_PX: Final = 40  # around them, so that features near their edges are whole
 _CONTRAST: Final = 0.02  # contrast threshold of features: OpenCV's default is 0.04
 _RATIO: Final = 0.85  # nearest over second nearest descriptor's distance at most (chosen; 0.8 finds a fifth less)
-_AGREE_PX: Final = (
-    6.0  # matches within so many map pixels of a similarity agree with it: photos are tilted, houses stand
-)
+_AGREE_PX: Final = 6.0
+"""Matches within so many map pixels of a similarity agree with it: photos are tilted, and houses stand high."""
 _FEWEST: Final = 8
 """Fewest matches that agree: houses that are alike let 5 or 6 agree by chance on a map whose detail is another one."""
 _LEAST_WIDTH_PX: Final = 60.0  # a photo covers at least so many pixels of the map: else one spot matches everything
@@ -88,10 +88,8 @@ def marks_on_map(
 
 def _map_features(gray: Gray, valid: Flags) -> tuple[Array, Floats]:
     """Features of a map, as many in each part of it."""
-    margin, corners = (
-        _PART_MARGIN_PX,
-        [(r, c) for r in range(0, len(gray), _PART_PX) for c in range(0, gray.shape[1], _PART_PX)],
-    )
+    margin = _PART_MARGIN_PX
+    corners = [(r, c) for r in range(0, len(gray), _PART_PX) for c in range(0, gray.shape[1], _PART_PX)]
 
     def part(corner: tuple[int, int]) -> tuple[Array, Floats]:
         top, left = (max(0, at - margin) for at in corner)
@@ -106,13 +104,12 @@ def _map_features(gray: Gray, valid: Flags) -> tuple[Array, Floats]:
 
 
 def _features(gray: Gray, most: int, valid: Flags | None = None) -> tuple[Array, Floats]:
-    """Places (K, 2), column and row, and RootSIFT descriptors (K, 128) of length 1 (Arandjelovic, Zisserman 2012)."""
+    """Places (K, 2), column and row, and descriptors float32 (K, 128), see `root_sift`."""
     sift = cv2.SIFT_create(nfeatures=most, contrastThreshold=_CONTRAST)  # type: ignore[attr-defined,unused-ignore]
     spots, found = sift.detectAndCompute(gray, None if valid is None else valid.astype(np.uint8))
     if found is None:
         return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
-    roots = np.sqrt(found / np.maximum(found.sum(1, keepdims=True), 1e-9))
-    return np.array([spot.pt for spot in spots]), roots.astype(np.float32)
+    return np.array([spot.pt for spot in spots]), root_sift(found)
 
 
 def _matches(photo: tuple[Array, Floats], other: tuple[Array, Floats]) -> tuple[Array, Array]:
@@ -120,19 +117,19 @@ def _matches(photo: tuple[Array, Floats], other: tuple[Array, Floats]) -> tuple[
     (own, mine), (spots, theirs) = photo, other
     if len(theirs) < 2 or not len(mine):
         return np.zeros((0, 2)), np.zeros((0, 2))
-    nearest, distance = np.zeros(len(mine), np.int64), np.zeros((2, len(mine)))
+    nearest, distance = np.zeros((2, len(mine)), np.int64), np.zeros((2, len(mine)))
     for start in range(0, len(mine), _AT_ONCE):
         some = slice(start, start + _AT_ONCE)
         alike = mine[some] @ theirs.T
-        rows, nearest[some] = np.arange(len(alike)), alike.argmax(1)
+        rows = np.arange(len(alike))
         for k in range(2):
-            best = alike.argmax(1)
+            best = nearest[k, some] = alike.argmax(1)
             distance[k, some] = np.sqrt(np.maximum(2.0 - 2.0 * alike[rows, best], 0.0))
             alike[rows, best] = -1.0
     clear = np.flatnonzero(distance[0] < _RATIO * distance[1])
     clear = clear[np.argsort(distance[0, clear], kind="stable")]
-    clear = clear[np.sort(np.unique(nearest[clear], return_index=True)[1])]
-    return own[clear], spots[nearest[clear]]
+    clear = clear[np.sort(np.unique(nearest[0, clear], return_index=True)[1])]
+    return own[clear], spots[nearest[0, clear]]
 
 
 def _agreeing(pixel: Array, spot: Array, width_px: int, reach_px: float) -> Indices:
