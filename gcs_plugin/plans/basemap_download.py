@@ -3,6 +3,7 @@
 What has come is kept beside the file until it is complete, so that the same command goes on where it stopped.
 """
 
+import http.client
 import json
 import math
 import sqlite3
@@ -72,7 +73,7 @@ def tile_server(address: str) -> TileSource:
         template = str(said["tiles"][0])
         template = template.replace("{y}", "{-y}") if said.get("scheme") == "tms" else template
         return TileSource(template, int(said.get("maxzoom", _DEEPEST)), str(said.get("attribution") or ""))
-    except (OSError, ValueError, KeyError, TypeError, IndexError):
+    except (OSError, ValueError, http.client.HTTPException, KeyError, TypeError, IndexError):
         raise InputError(f"{address} gives no TileJSON; give https://.../{{z}}/{{x}}/{{y}}.png") from None
 
 
@@ -204,7 +205,7 @@ def _tile(template: str, z: int, x: int, y: int) -> bytes | None:
                     f"the server refuses its tiles ({error.code}); check the address and its key"
                 ) from None
             why = f"it answers {error.code}"
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, http.client.HTTPException) as error:
             why = str(getattr(error, "reason", error))
         if attempt < _TRIES - 1:
             time.sleep(_PAUSE_S * 2**attempt)

@@ -41,6 +41,11 @@ class Tiles(BaseHTTPRequestHandler):
         server.asked.append(self.path)
         if len(server.asked) > server.until:
             return self.send_error(503)
+        if len(server.asked) == server.cut:  # the connection ends in the middle of a tile
+            self.send_response(200)
+            self.send_header("Content-Length", "1000")
+            self.end_headers()
+            return self.wfile.write(b"\x89PNG")
         if server.refuses:
             return self.send_error(403)
         z, x, y = (int(part.split(".")[0]) for part in self.path.strip("/").split("/"))
@@ -61,9 +66,9 @@ class Tiles(BaseHTTPRequestHandler):
 
 
 @contextmanager
-def serving(until=10**9, refuses=False):
+def serving(until=10**9, refuses=False, cut=0):
     server = ThreadingHTTPServer(("127.0.0.1", 0), Tiles)
-    server.asked, server.until, server.refuses = [], until, refuses
+    server.asked, server.until, server.refuses, server.cut = [], until, refuses, cut
     server.base = f"http://127.0.0.1:{server.server_port}"
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()
@@ -131,6 +136,12 @@ def test_it_goes_on_where_the_server_failed(area, tmp_path, capsys):
         assert not first & set(server.asked)
     assert out.exists() and list(tmp_path.glob(".*.part")) == []
     assert "the server names no licence" in capsys.readouterr().out
+
+
+def test_a_tile_that_is_cut_off_is_asked_for_again(area, tmp_path):
+    with serving(cut=3) as server:
+        assert fetch(server.base + "/{z}/{x}/{y}.png", area, tmp_path / "before.mbtiles") == 0
+        assert len(server.asked) == len(set(server.asked)) + 1
 
 
 @pytest.mark.parametrize(
