@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,12 +113,15 @@ def _column(values: list[Any], kind: type[np.generic]) -> NDArray[Any]:
 
 
 _JOINED_AT_ONCE = 64  # frames that one task joins; it changes the speed, not the result
+_SQUARE_PX: Final = 4
+"""Side of the squares of the map that outlines go round, pixels: seams are chosen in cells of at least that many, and
+outlines of single pixels took a sixth of the drawing of full-size photos."""
 
 
 def write_seamlines(
     path: Path, canvas: Canvas, describe: Sequence[Callable[[], Mapping[str, Any]]], *, run: Run = serial
 ) -> None:
-    """Write a multipolygon for each picture that the orthoimage shows.
+    """Write a multipolygon for each picture that the orthoimage shows, of squares by what each shows at its middle.
 
     Args:
         path: the GeoPackage; appears when it is complete. canvas: rendered, with plane "frame".
@@ -164,10 +167,13 @@ def _tile_polygons(path: Path, key: Key) -> tuple[list[int], list[bytes]]:
         labels: Ints = canvas.read_plane(
             row * t, min(grid.height, (row + 1) * t), col * t, min(grid.width, (col + 1) * t)
         )
+    side = _SQUARE_PX
+    rows, cols = (np.minimum(np.arange(side // 2, n + side // 2, side), n - 1) for n in labels.shape)
+    labels = np.ascontiguousarray(labels[np.ix_(rows, cols)])
     left, top = grid.west + col * t * grid.gsd_m, grid.north - row * t * grid.gsd_m
-    corner = from_origin(left, top, grid.gsd_m, grid.gsd_m)
+    corner = from_origin(left, top, side * grid.gsd_m, side * grid.gsd_m)
     frames, polygons = [], []
-    for shape, value in shapes(np.ascontiguousarray(labels), mask=labels > 0, transform=corner):
+    for shape, value in shapes(labels, mask=labels > 0, transform=corner):
         shell, *holes = shape["coordinates"]
         frames.append(int(value) - 1)
         polygons.append(shapely.Polygon(shell, holes))
