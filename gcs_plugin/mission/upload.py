@@ -110,7 +110,7 @@ class MissionUpload(Exchange):
         kind = self._mission_kind(message)
         if self.stage is UploadStage.CLEAR:
             if kind == "MISSION_ACK" and message.type == exchange.ACCEPTED:
-                self._unknown("was cleared")
+                self._unknown(" and was cleared")
             return []
         if kind in ("MISSION_REQUEST", "MISSION_REQUEST_INT"):
             return self._requested(int(message.seq), now)
@@ -315,6 +315,9 @@ class MissionUpload(Exchange):
         if reading.outcome is None:
             return messages
         self._heard_at = now
+        if reading.items is None and self.mission_type != MISSION:
+            self._unknown()  # any fence protects more than none
+            return messages
         if reading.items is None:
             self._reading, self.stage, self._clears = None, UploadStage.CLEAR, 0
             return messages + self._clear(now)
@@ -340,16 +343,16 @@ class MissionUpload(Exchange):
         """A mission that cannot be read back must not be flown: clear it."""
         self._clears += 1
         if self._clears > _CLEARS:
-            self._unknown("was told to clear it, and did not answer")
+            self._unknown(" and was told to clear it, and did not answer")
             return []
         self.deadline = now + _COUNT_AGAIN_S
         to = self.vehicle
         return [dialect.MAVLink_mission_clear_all_message(to.system, to.component, self.mission_type)]
 
-    def _unknown(self, what: str) -> None:
+    def _unknown(self, then: str = "") -> None:
         self.stage = UploadStage.DONE
         name = f"vehicle {self.vehicle.system}: its {self.mission.kind}"
-        text = f"{name} could not be read back and {what}; what it holds is not known: upload again"
+        text = f"{name} could not be read back{then}; what it holds is not known: upload again"
         self._end(False, text, Verdict.UNKNOWN)
 
     def _fail(self, text: str, failure: Verdict = Verdict.REFUSED) -> None:

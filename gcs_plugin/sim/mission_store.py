@@ -131,7 +131,7 @@ class MissionStore:
                 return [self.fence[message.seq].message(int(message.seq), to.system, to.component, FENCE)]
             case "MISSION_ACK":
                 return []
-            case "MISSION_COUNT" if message.count == 0:
+            case "MISSION_CLEAR_ALL" | "MISSION_COUNT" if getattr(message, "count", 0) == 0:
                 self.fence = []
                 return [self._ack(to, exchange.ACCEPTED, FENCE)]
             case "MISSION_COUNT":

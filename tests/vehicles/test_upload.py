@@ -9,6 +9,7 @@ from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.links.packets import Framer
 from gcs_plugin.mission.download import MissionDownload
 from gcs_plugin.mission.exchange import GROUND_STATION, Address, Verdict
+from gcs_plugin.mission.geofence import FenceZone, fence_mission, zones_of
 from gcs_plugin.mission.items import (
     CHANGE_SPEED,
     FRAME_RELATIVE,
@@ -329,6 +330,19 @@ def test_a_mission_that_cannot_be_read_back_is_cleared(autopilot):
     (outcome,) = rig.run(uploading)
     assert outcome.verdict is Verdict.UNKNOWN and "was cleared" in outcome.text
     assert len(rig.store.items) == mission.first_seq
+
+
+@BOTH
+def test_a_geofence_that_cannot_be_read_back_is_left_to_protect(autopilot):
+    zone = FenceZone("exclusion", ((8.5456, 47.3977),), radius_m=50.0)
+    rig = Rig(autopilot)
+    uploading = upload(rig, fence_mission([zone], autopilot), patience_s=5.0)
+    while not rig.acks:
+        rig.step()
+    rig.down = Channel(faults=Faults(silent=((0.0, rig.now + 8.0),)))
+    (outcome,) = rig.run(uploading)
+    assert outcome.verdict is Verdict.UNKNOWN and "clear" not in outcome.text and "upload again" in outcome.text
+    assert zones_of(rig.store.fence) == [zone]
 
 
 @pytest.mark.parametrize("seed", range(6))
