@@ -15,7 +15,7 @@ from gcs_plugin.mission.download import MissionDownload
 from gcs_plugin.mission.exchange import MISSION, NEVER, Exchange, Verdict
 from gcs_plugin.mission.flight_modes import HOLDS, LANDS, RETURNS
 from gcs_plugin.mission.flown_items import off_leg_m
-from gcs_plugin.mission.items import Mission
+from gcs_plugin.mission.items import Mission, difference
 from gcs_plugin.mission.start_dialogue import BreakOff, Start
 from gcs_plugin.mission.upload import MissionUpload
 from orthoswarm.model.errors import OrthoSwarmError
@@ -168,7 +168,8 @@ class Dialogues:
             return
         if job.outcome is not None and isinstance(job, MissionDownload):
             vehicle.mission_was_read(self._clock())
-        if vehicle.mission != mission or not vehicle.detector.knows:
+        other = vehicle.mission is None or difference(vehicle.mission, mission.items)
+        if other or not vehicle.detector.knows:
             vehicle.mission = mission
             vehicle.detector.knows_mission(mission)
 

@@ -3,6 +3,7 @@
 import math
 import threading
 from dataclasses import replace
+from functools import partial
 
 import pytest
 
@@ -140,5 +141,10 @@ def test_the_routes_are_what_the_vehicles_hold(open_links, folder) -> None:  # n
         assert [point for point in row["points"] if point in flown][-1] == flown[-1]
         assert row["points"][-1][0] == len(items) - 1  # the way home, by the last item
         assert row["points"][-1][1:] == pytest.approx(row["points"][0][1:], abs=1e-4)
+    held = [vehicle.mission for vehicle in links.fleet.vehicles.values()]
+    for system in (1, 2):  # what is left to PX4 is not a number, which equals nothing
+        links.finish(links.fleet.call(partial(links.fleet.download, system)))
+    assert [row["route"] for row in links.rows()] == numbers
+    assert all(v.mission is mission for v, mission in zip(links.fleet.vehicles.values(), held, strict=True))
     upload_all(links, folder)  # the same again
     assert all(row["route"] > number for row, number in zip(links.rows(), numbers, strict=True))
