@@ -93,7 +93,7 @@ class Daemon:
         self.refused = RefusedPictures(self.events)
         self.console = ConsoleState(self.journal, self.events)
         self.people = People(self.journal, self.events)
-        self.pilots = Pilots(self.people, self.events)
+        self.pilots = Pilots(self.people, self.events, self.journal)
 
     def _open_vehicles(self) -> None:
         """The vehicles on their links, and their takeoffs."""

@@ -1,8 +1,7 @@
 """The people of a command post: invitations, sessions and roles, who has which vehicle, and who did what when.
 
 A secret (of an invitation, of a session) is given out once; the journal has its hash alone. Secrets are random, so one
-round of SHA-256 hides them. Who has which vehicle is kept in memory: who commands a free one has it, until it is handed
-over, freed, or its pilot is gone; after a restart vehicles are free.
+round of SHA-256 hides them. Who commands a free vehicle has it, until it is handed over, freed, or its pilot is gone.
 """
 
 import csv
@@ -20,7 +19,7 @@ from enum import IntEnum
 from typing import Any, Final, NamedTuple
 
 from gcs_plugin.daemon.store.daemon_events import Events
-from gcs_plugin.daemon.store.journal import Journal, packed, unpacked
+from gcs_plugin.daemon.store.journal import Journal, fact_change, packed, unpacked
 from orthoswarm.export.product_files import iso_time
 from orthoswarm.export.tactical.places import spreadsheet_cell
 from orthoswarm.model.errors import InputError, OrthoSwarmError
@@ -256,12 +255,16 @@ class _Hold:
 
 
 class Pilots:
-    """Who has which vehicle; `people`: knows who is here. `events`: tells pages."""
+    """Who has which vehicle; `people`: knows who is here. `events`: tells pages. `journal`: keeps it over a restart."""
 
-    def __init__(self, people: People, events: Events) -> None:
-        self._people, self._events = people, events
+    def __init__(self, people: People, events: Events, journal: Journal) -> None:
+        self._people, self._events, self._journal = people, events, journal
         self._lock = threading.Lock()
         self._holds: dict[str, _Hold] = {}
+        for vehicle, number in (journal.fact("holds") or {}).items():
+            if (pilot := people.find(number)) is not None:
+                self._holds[vehicle] = _Hold(pilot)
+                people.seen(pilot)  # the page needs some seconds to find the daemon again
 
     def rows(self) -> list[dict[str, Any]]:
         """Vehicles with a pilot who is here, as JSON: `vehicle`, `pilot` and `asked` ({`id`, `name`} or null)."""
@@ -339,7 +342,9 @@ class Pilots:
         return hold if self._people.is_here(hold.pilot.id, GONE_S) else None
 
     def _tell(self) -> None:
-        self._events.tell("holds", rows=self.rows())
+        rows = self.rows()
+        self._journal.submit(fact_change("holds", {row["vehicle"]: row["pilot"]["id"] for row in rows}))
+        self._events.tell("holds", rows=rows)
 
 
 def _row(person: Person | None) -> dict[str, Any] | None:

@@ -17,7 +17,9 @@ class Post:
         events = Events()
         events.on(Told, lambda event: self.told.append(event) if event.page == "holds" else None)
         self.people = People(self.journal, events, clock=lambda: self.now)
-        self.pilots = Pilots(self.people, events)
+        self.pilots = Pilots(self.people, events, self.journal)
+        if self.people.rows():  # after a restart
+            return
         self.anna, self.ben = self.joined("Anna"), self.joined("Ben")
 
     def joined(self, name) -> Person:
@@ -113,6 +115,18 @@ def test_people_and_their_sessions_survive_a_restart(post, tmp_path):
     assert again.of_session(joined[1]) == joined[0]
     assert again.find(joined[0].id) == joined[0]
     assert again.join(invitation) is None
+
+
+def test_pilots_keep_their_vehicles_over_a_restart(post, tmp_path):
+    post.pilots.claim(post.anna, ["v1", "v2"])
+    post.pilots.change(post.anna, "v2", "free")
+    post.journal.close()
+    again = Post(tmp_path)
+    assert [(row["vehicle"], row["pilot"]["name"]) for row in again.pilots.rows()] == [("v1", "Anna")]
+    assert "Anna has v1" in again.pilots.claim(post.ben, ["v1"])["v1"]
+    again.now += GONE_S + 1.0  # her page did not come back
+    assert again.pilots.claim(post.ben, ["v1"]) == {}
+    again.journal.close()
 
 
 def test_an_invitation_that_nobody_opened_in_a_day_is_void(post, monkeypatch):
