@@ -58,11 +58,13 @@ class LiveRegistration:
 
     Args:
         basemap: where vehicles are registered; None for none. events: told when there are enough first pictures.
-        read: reads a picture file, uint8 (rows, columns, 4).
+        read: reads a picture file, uint8 (rows, columns, 4). drawn: how many pictures of a sortie are drawn already.
     """
 
-    def __init__(self, basemap: Path | None, events: Events, read: Callable[[Path], Bytes]) -> None:
-        self._basemap, self._events, self._read = basemap, events, read
+    def __init__(
+        self, basemap: Path | None, events: Events, read: Callable[[Path], Bytes], drawn: Callable[[Whose], int]
+    ) -> None:
+        self._basemap, self._events, self._read, self._drawn = basemap, events, read, drawn
         self._flown: dict[Whose, _Flown] = {}
         self._answers: deque[VehicleLookedFor] = deque()
 
@@ -90,7 +92,9 @@ class LiveRegistration:
         if not self.works or pending.frame.damaged:
             return None
         whose = (pending.frame.vehicle, pending.sortie)
-        flown = self._flown.setdefault(whose, _Flown())
+        flown = self._flown.get(whose)
+        if flown is None:  # of a sortie that was under way before a restart, those from before count
+            flown = self._flown[whose] = _Flown(came=min(self._drawn(whose), _FIRST - 1))
         if flown.block is not None and _size(flown.block.newest) != _size(pending.frame):
             return None  # another lens than the one that was found
         pose = None if flown.block is None else self._next(flown, pending, picture, waiting)

@@ -11,6 +11,7 @@ import threading
 import time
 from bisect import bisect_left
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -81,7 +82,7 @@ class Drawer(Background):
             basemap: where pictures are registered before they are drawn, None for nowhere.
         """
         super().__init__("drawing", join_s=None)
-        self.registration = LiveRegistration(basemap, events, read)
+        self.registration = LiveRegistration(basemap, events, read, partial(frame_rows.drawn_in_sortie, journal))
         self._in_memory, self._late_s, self._look_s, self._read = in_memory, late_s, look_s, read
         self._journal, self._store, self._site, self._events = journal, store, site, events
         self._begun = 0

@@ -209,6 +209,12 @@ def sortie_is_drawn(journal: Journal, vehicle: str, sortie: int | None) -> bool:
     return journal.one(query, (packed(vehicle), sortie)) is None
 
 
+def drawn_in_sortie(journal: Journal, whose: Whose) -> int:
+    """How many pictures of a sortie are drawn."""
+    query = "SELECT COUNT(*) AS n FROM frames WHERE drawn = 1 AND vehicle = ? AND sortie = ?"
+    return int(journal.rows(query, (packed(whose[0]), whose[1]))[0]["n"])
+
+
 def undrawn_before(journal: Journal, arrived_s: float) -> int:
     """How many pictures came before a time (UTC epoch seconds) and wait to be drawn."""
     return int(journal.rows("SELECT COUNT(*) AS n FROM frames WHERE drawn = 0 AND arrived < ?", (arrived_s,))[0]["n"])

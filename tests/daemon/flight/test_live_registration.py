@@ -22,7 +22,7 @@ def pending(seq):
 
 def test_a_vehicle_that_is_not_found_is_looked_for_again_however_many_pictures_came():
     asked, events = [], Events()
-    registration = LiveRegistration(Path("map.tif"), events, lambda path: None)
+    registration = LiveRegistration(Path("map.tif"), events, lambda path: None, lambda whose: 0)
     events.on(FirstPicturesCame, lambda event: asked.append((event.vehicle, event.sortie)))
     counts = []
     for seq in range(1, 6 * MOST_LOOKED_FOR):

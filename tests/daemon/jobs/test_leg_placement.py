@@ -238,6 +238,20 @@ def test_pictures_lie_on_the_basemap_as_they_come_and_once_refined(tmp_path, cap
     first_errors(workspace, shots, tmp_path, capsys)
 
 
+def test_after_a_restart_in_flight_the_next_pictures_lie_on_the_basemap(tmp_path):
+    ground = made_up_ground()
+    write_map(ground, tmp_path / "map.tif")
+    shots = shots_over(ground, tmp_path / "p")
+    for before, upto in ((0, 22), (22, 28)):  # fewer after the restart than a vehicle is looked for with
+        with serving(tmp_path / "w", "--basemap", str(tmp_path / "map.tif")) as served:
+            for shot in shots[before:upto]:
+                assert served.send(shot).status_code == 201
+            served.until("/api/frames", lambda rows, n=upto: sum(r["placed_by"] == "map" for r in rows) == n)
+            rows = served.get("/api/frames?poses=1").json()
+    assert {row["stage"] for row in rows} == {"realtime"}
+    lies_at_its_place(rows, shots)
+
+
 def lies_at_its_place(rows, shots, within_m=0.6):
     """Homographies put the pictures' middles near their true places, from which the records are 3 m off."""
     records = {shot.pose["image"]: GRID.to_grid(shot.pose["lat_deg"], shot.pose["lon_deg"]) for shot in shots}
