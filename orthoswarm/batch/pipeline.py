@@ -20,6 +20,7 @@ from orthoswarm.batch.run_state import (
     RunContext,
     RunState,
 )
+from orthoswarm.batch.unreferenced import PART, keep_picture
 from orthoswarm.batch.workspace import Workspace, run_key
 from orthoswarm.compute.stage_times import Clock
 from orthoswarm.compute.workers import Workers, prepare_process, usage_of, workers
@@ -55,7 +56,9 @@ from orthoswarm.trajectory.legs import split_legs
 
 _SPOT_DEG: Final = 0.001  # records farther apart than 110 m are none of a vehicle that hovers
 _QUICK_LOOK: Final = "a quick look at a quarter of the detail; the same command without --quick goes on from it"
+_UNKNOWN: Final = "nothing tells where it is"
 _MARKS: Final = "two control points, some way apart, must be seen in them"
+_APART: Final = "none with the largest part, of which the picture is made"
 _NOT_FOUND: Final = "they were not found on the basemap within the radius of --near"
 _BESIDE_PHOTOS: Final = 15
 """Photos with a position before and after, of the same flight, that may show the ground of one without (its cost)."""
@@ -95,6 +98,22 @@ def run(
     """
     if options.basemap is not None and not exists(options.basemap):
         raise InputError(f"the basemap {address_of(options.basemap)} does not exist; check the path")
+    if options.unreferenced:
+        return keep_picture(
+            out, _run(load, out / PART, replace(options, tiles="no"), workers, progress, drawers, publish)
+        )
+    return _run(load, out, options, workers, progress, drawers, publish)
+
+
+def _run(
+    load: Load,
+    out: Path,
+    options: MapOptions,
+    workers: Workers,
+    progress: Progress,
+    drawers: Workers | None,
+    publish: Callable[[], None] | None,
+) -> dict[str, Any]:
     with Workspace(out) as space:
         context = RunContext(
             out=out,
@@ -148,9 +167,13 @@ def _load(run: RunContext, load: Load) -> RunState:
         raise disk_error(error, run.out) from None
     ingest = without_false_spots(run, in_one_area(ingest))
     beside = bool(ingest.frames) and run.options.until != "realtime"  # photos that may tell where others were taken
-    told = run.options.control is not None or run.options.near is not None
+    told = run.options.control is not None or run.options.near is not None or run.options.unreferenced
+    if run.options.unreferenced and ingest.frames:
+        raise InputError(f"{len(ingest.frames)} pictures have a position: leave out --unreferenced to map them")
     if ingest.unpositioned and (beside or told):
         ingest = with_found_positions(run, ingest)
+    elif run.options.near is not None:
+        ingest = replace(ingest, warnings=[*ingest.warnings, "--near was not used: every picture has a position"])
     if not ingest.frames:
         raise nothing_to_map(ingest)
     grid = area_grid(ingest.frames)
@@ -353,18 +376,30 @@ def with_found_positions(run: RunContext, ingest: Ingest) -> Ingest:
         require_places((point.name, point.surveyed) for point in points)
     if options.near is not None:
         searched = _searched_map(options)
-    if options.control is None and searched is None:
+    if options.control is None and searched is None and not options.unreferenced:
         photos, positioned = _beside(ingest)
     placed, left = place_unpositioned(
-        photos, positioned, points, searched=searched, read_gray=_reduced, run=run.workers.map, progress=run.progress
+        photos,
+        positioned,
+        points,
+        searched=searched,
+        anywhere=options.unreferenced,
+        read_gray=_reduced,
+        run=run.workers.map,
+        progress=run.progress,
     )
+    if options.unreferenced and not placed:
+        raise OrthoSwarmError(f"no two of {len(photos)} photos without a position show ground in common")
     if searched is not None and not placed and not ingest.frames:
         raise OrthoSwarmError(f"{len(photos)} photos have no position, and {_NOT_FOUND}; give another place or radius")
     names = {frame.image for frame in placed}
     by = "control points" if points else "the photos beside them" if searched is None else "the basemap"
     said = [f"{len(placed)} photos without a position were placed by {by}"] if placed else []
-    if points or searched is not None:
-        said += _left_out(len(photos) - len(placed), left, _MARKS if searched is None else _NOT_FOUND)
+    if options.unreferenced:
+        said = _left_out(len(photos) - len(placed), left, _APART)
+    elif points or searched is not None:
+        why = f"{_UNKNOWN}: {_MARKS if searched is None else _NOT_FOUND}"
+        said += _left_out(len(photos) - len(placed), left, why)
     return replace(
         ingest,
         frames=_in_order([*ingest.frames, *placed], ingest),
@@ -385,10 +420,10 @@ def _searched_map(options: MapOptions) -> SearchedMap:
 
 
 def _left_out(count: int, blocks: list[list[str]], why: str) -> list[str]:
-    """What is said about photos that control points or the basemap could not place."""
+    """What is said about photos that control points, the basemap or others could not place."""
     said = [
-        f"{len(block)} photos without a position ({_first_of(block)}) show ground in common, but nothing tells where "
-        f"it is: {why}; they are left out"
+        f"{len(block)} photos without a position ({_first_of(block)}) show ground in common, but {why}; they are left "
+        "out"
         for block in blocks
     ]
     alone = count - sum(map(len, blocks))

@@ -18,6 +18,7 @@ from orthoswarm.batch.run_state import (
     PRODUCTS,
     REALTIME,
     SEAMLINES,
+    UNREFERENCED,
     RunContext,
     RunState,
 )
@@ -46,7 +47,7 @@ def write_products(
     run: RunContext, state: RunState, placed: list[PlacedFrame], refinement: Refinement | None
 ) -> dict[str, Any]:
     """frames.jsonl, footprints and the report."""
-    for name in PRODUCTS:  # left by an earlier run with other options
+    for name in (*PRODUCTS, UNREFERENCED):  # left by an earlier run with other options
         if name not in _made(run, state.fault is not None):
             remove_product(run.out, name)
     remove_collection(run.out)
@@ -128,7 +129,7 @@ def _report(
         "peak_rss_mb": memory,
         "ground_z_m": ground_z_m,
         "refine": run.options.refine if solutions else "none",
-        "warnings": list(dict.fromkeys(state.warnings)),
+        "warnings": list(dict.fromkeys(state.ingest.warnings if run.options.unreferenced else state.warnings)),
         "epsg": state.grid.epsg,
         "gsd_m": state.gsd_m,
         "area_ha": state.drawn.area_m2 / 1e4,

@@ -48,7 +48,9 @@ PRODUCTS = (
 )
 
 
-WRITTEN = (*PRODUCTS, *(name.replace(".tif", ".vrt") for name in (REALTIME, COARSE, ORTHOIMAGE)), FOLDER)
+UNREFERENCED = "unreferenced.tif"
+
+WRITTEN = (*PRODUCTS, UNREFERENCED, *(name.replace(".tif", ".vrt") for name in (REALTIME, COARSE, ORTHOIMAGE)), FOLDER)
 """Files and folders that runs write, those of rasters in tiles among them."""
 
 
@@ -65,6 +67,7 @@ class MapOptions:
         basemap: the pre-disaster map, None to stay in the receivers' frame.
         near: latitude and longitude, degrees, and a radius, metres, within which photos without a position are looked
             for on the basemap; None: they are not.
+        unreferenced: of photos without any position make a picture without coordinates, see batch.unreferenced.
         refine: which refiner. until: the last stage to run.
         fov_min_deg: theta-hat, the assumed field of view of the real-time stage; None takes hints, else 70.
         gsd_m: ground pixel of the products; None for the median ground pixel at nadir.
@@ -83,6 +86,7 @@ class MapOptions:
 
     basemap: Path | None = None
     near: tuple[float, float, float] | None = None
+    unreferenced: bool = False
     refine: RefinerName = "swarm"
     until: Literal["realtime", "coarse", "fine"] = "fine"
     fov_min_deg: float | None = None

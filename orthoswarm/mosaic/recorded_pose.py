@@ -209,6 +209,7 @@ def nothing_to_map(ingest: Ingest) -> OrthoSwarmError:
     if not ingest.unpositioned:
         return InputError(said)
     return OrthoSwarmError(
-        f"{said}, mark at least two surveyed points in them (--control), "
-        "or say where they were taken, with a basemap (--near, --basemap)"
+        f"{said}; or mark at least two surveyed points in them (--control), "
+        "say where they were taken, with a basemap (--near, --basemap), or make a picture without coordinates of them "
+        "(--unreferenced)"
     )

@@ -4,8 +4,10 @@ import json
 import shutil
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
+import rasterio
 
 from gcs_plugin.cli.main import main
 from tests.batch.test_control_run import survey
@@ -53,6 +55,42 @@ def test_photos_that_recorded_nothing_are_placed_by_control_points(flight, tmp_p
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_photos_that_nothing_places_become_a_picture_without_coordinates(flight, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert mosaic(flight, "bare", out, "--unreferenced") == 0
+    assert sorted(path.name for path in out.iterdir()) == ["report.json", "unreferenced.tif"]
+    report = json.loads((out / "report.json").read_text())
+    assert report["frames"]["used"] == 32 and "is a picture, not a map" in report["headline"]
+    with rasterio.open(out / "unreferenced.tif") as picture:
+        assert picture.crs is None and picture.transform.is_identity and not picture.gcps[0]
+        rgba = np.moveaxis(picture.read(), 0, -1)
+    found = like_the_scene(np.ascontiguousarray(rgba[..., :3]), rgba[..., 3])
+    assert found.sum() > 60 and found.mean() > 0.7  # the others are wrong pairs of features
+    capsys.readouterr()
+    assert mosaic(flight, "mixed", tmp_path / "other", "--unreferenced") == 2
+    assert "16 pictures have a position" in capsys.readouterr().err
+    assert mosaic(flight, "bare", tmp_path / "other", "--unreferenced", "--control", flight / "control.csv") == 2
+    for name in ("DJI_0000.JPG", "DJI_0007.JPG"):  # at the ends of a leg
+        (tmp_path / "few").mkdir(exist_ok=True)
+        shutil.copy(flight / "bare" / "a" / name, tmp_path / "few")
+    assert mosaic(tmp_path, "few", tmp_path / "other", "--unreferenced") == 1
+    assert "no two of 2 photos without a position show ground in common" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()
+
+
+def like_the_scene(rgb, seen):
+    """Which features of a picture lie within two of its pixels of where one similarity puts those of the scene."""
+    sift, grays = cv2.SIFT_create(2000), (cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), Scene().rgb.mean(-1).astype(np.uint8))
+    (here, ours), (there, theirs) = (sift.detectAndCompute(g, m) for g, m in zip(grays, (seen, None), strict=True))
+    pairs = cv2.BFMatcher().knnMatch(ours, theirs, k=2)
+    good = [a for a, b in pairs if a.distance < 0.7 * b.distance]
+    one, other = (np.float32([k[getattr(m, n)].pt for m in good]) for k, n in ((here, "queryIdx"), (there, "trainIdx")))
+    _, inliers = cv2.estimateAffinePartial2D(other, one, ransacReprojThreshold=2.0)
+    return inliers.ravel() > 0
+
+
+@pytest.mark.slow
 def test_photos_with_positions_help_to_place_those_without(flight, tmp_path):
     """One point lies in photos of the other vehicle only: a single one could not place it alone."""
     lines = (flight / "control.csv").read_text().splitlines()
@@ -67,7 +105,11 @@ def test_photos_with_positions_help_to_place_those_without(flight, tmp_path):
 def test_without_control_points_they_stay_out_with_the_reason(flight, tmp_path, capsys):
     assert mosaic(flight, "bare", tmp_path / "none") == 1
     said = capsys.readouterr().err
-    assert "has no position" in said and "mark at least two surveyed points in them (--control)" in said
+    assert (
+        "has no position" in said
+        and "mark at least two surveyed points in them (--control)" in said
+        and "--unreferenced" in said
+    )
     out = tmp_path / "mixed"
     assert mosaic(flight, "mixed", out, "--until", "realtime") == 0
     frames = [json.loads(line) for line in (out / "frames.jsonl").read_text().splitlines()]
@@ -210,6 +252,9 @@ def test_photos_that_recorded_nothing_are_found_on_the_basemap_near_a_place(flig
     report = json.loads((out / "report.json").read_text())
     assert any("32 photos without a position were placed by the basemap" in w for w in report["warnings"])
     assert not any("receivers say" in w for w in report["warnings"])
+    assert mosaic(flight, "mixed/a", out, *near(flight, scene.lat, scene.lon), "--until", "realtime") == 0
+    report = json.loads((out / "report.json").read_text())
+    assert "--near was not used: every picture has a position" in report["warnings"]
 
 
 @pytest.mark.parametrize(

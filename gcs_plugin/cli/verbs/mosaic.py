@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from orthoswarm.model.task_runner import Progress
 
 _NEAR_M = 300.0  # an area that people can name, and that is searched in a minute
+_PLACING = ("basemap", "near", "control", "checkpoints", "dem", "surface")  # what needs coordinates, or gives them
 _REASONS = 5  # printed; all are in the report
 
 
@@ -37,6 +38,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help=f"look for photos without a position on the basemap, within M metres of there (default {_NEAR_M:g})",
     )  # fmt: skip
     add("--out", type=path_of, required=True, metavar="DIR", help="output folder; an interrupted run goes on there")
+    add(
+        "--unreferenced", action="store_true",
+        help="of photos without any position make a picture without place, scale and north: unreferenced.tif",
+    )  # fmt: skip
     refiners = ["swarm", "paper"] if find_spec("orthoswarm.paper") else ["swarm"]
     add("--refine", choices=refiners, default=refiners[0], help=f"how pictures are refined (default {refiners[0]})")
     add(
@@ -258,6 +263,10 @@ def _check(args: argparse.Namespace) -> None:
         raise InputError(f"--workers {args.workers} is too few; give 1 or more")
     if args.near is not None and args.basemap is None:
         raise InputError("--near says where on the basemap photos are looked for; give one with --basemap")
+    if args.unreferenced and (any(getattr(args, name) is not None for name in _PLACING) or args.until != "fine"):
+        raise InputError(f"--unreferenced goes without {', '.join(f'--{name}' for name in _PLACING)} and --until")
+    if args.unreferenced and is_stored(args.out):
+        raise InputError("--unreferenced writes into a folder of this machine; name one for --out")
     if args.tone == "map":
         if args.basemap is None:
             raise InputError("--tone map takes brightness and hue from a basemap; give one with --basemap")

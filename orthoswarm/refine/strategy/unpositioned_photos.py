@@ -20,10 +20,16 @@ from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.task_runner import Progress, Run
 from orthoswarm.refine.features.working_pictures import ReadGray
 from orthoswarm.refine.flight.sparse_start import read_photo_records
-from orthoswarm.refine.initial.free_network import FREE_PAIR_SHARE, Anchors, FreeNetwork, solve_free_network
+from orthoswarm.refine.initial.free_network import (
+    FREE_PAIR_SHARE,
+    Anchors,
+    FreeNetwork,
+    solve_free_network,
+)
+from orthoswarm.refine.initial.heading import components
 from orthoswarm.refine.initial.initial_orientation import shape_of
 from orthoswarm.refine.initial.pair_graph import PairGraphBuilder
-from orthoswarm.refine.initial.planar_similarity import PhotoRecords, rotation_of
+from orthoswarm.refine.initial.planar_similarity import PairGraph, PhotoRecords, rotation_of
 from orthoswarm.refine.initial.relative_scale import focal_by_hint
 from orthoswarm.refine.initial.tilt_and_lens import PairMatches, TiltAndLens, level_pixels, similarities, spaced
 from orthoswarm.refine.registration.photos_on_map import FoundMarks, SearchedMap, marks_on_map
@@ -33,6 +39,9 @@ _FREE_NADIR_SHARE: Final = 0.05
 width: tilts of three degrees at a field of view of 60."""
 _FREE_MOST_PAIRS: Final = 40_000  # most pairs tried where nothing tells overlaps: 280 photos, two minutes of CPU
 
+
+_ANYWHERE_DEG: Final = (0.0, 3.0)  # latitude, longitude: on a central meridian, where north is up
+_ANYWHERE_M: Final = 100.0  # ground in a photo: usual, which is what later stages look for
 
 _MAP_MOST_PHOTOS: Final = 60  # photos that are looked for on the basemap: a second of CPU each
 _MAP_MOST_MARKS: Final = 10  # places that each of those found gives to the network (chosen)
@@ -56,6 +65,7 @@ def place_unpositioned(
     points: Sequence[Checkpoint],
     *,
     searched: SearchedMap | None = None,
+    anywhere: bool = False,
     read_gray: ReadGray,
     run: Run,
     progress: Progress | None = None,
@@ -64,9 +74,10 @@ def place_unpositioned(
 
     photos: without positions (their latitude and longitude are NaN), of a vehicle in order of time. positioned: photos
     with positions, which may show the same ground. points: surveyed, with their marks in photos of either kind.
-    searched: where photos are looked for on the basemap.
+    searched: where photos are looked for on the basemap. anywhere: nothing tells where they lie; the largest part of
+    those that show ground in common is put at an arbitrary place, in an arbitrary size and direction.
     """
-    places = _known_places(positioned, points, searched)
+    places = np.array([_ANYWHERE_DEG]) if anywhere else _known_places(positioned, points, searched)
     if not photos or not len(places):
         return PlacedPhotos([], [])
     grid = LocalGrid(area_epsg(places[:, 0], places[:, 1]) if searched is None else searched.basemap.epsg)
@@ -86,6 +97,8 @@ def place_unpositioned(
     anchors = _anchors(frames, records, points, grid=grid, origin=origin, known=len(photos))
     if searched is not None:
         anchors = anchors.joined(_map_anchors(photos, searched, origin, read_gray, progress))
+    if anywhere:
+        anchors = _arbitrary_anchors(graph, records)
     anchors = replace(anchors, pixel=level_pixels(anchors.pixel, anchors.photo, records, shape))
     network = solve_free_network(graph, len(frames), records.width, anchors)
     left = [[frames[k].image for k in part] for part in network.left]
@@ -181,6 +194,22 @@ def _anchors(
         ground=np.array(ground_, np.complex128),
         sigma_m=np.array(sigma_m, float),
         sigma_px=np.array(sigma_px_, float),
+    )
+
+
+def _arbitrary_anchors(graph: PairGraph, records: PhotoRecords) -> Anchors:
+    """The photo with most pairs in the largest part, as if it were `_ANYWHERE_M` wide and taken at the origin."""
+    largest = np.flatnonzero(components(graph, len(records.width)) == 0)
+    pairs = np.bincount(np.r_[graph.first, graph.second], minlength=len(records.width))
+    photo = int(largest[pairs[largest].argmax()])
+    width = float(records.width[photo])
+    at = np.array([0.0, 0.5], np.complex128)  # its middle, and the middle of its right edge
+    return Anchors(
+        photo=np.full(2, photo, np.int32),
+        pixel=at * width,
+        ground=at * _ANYWHERE_M,
+        sigma_m=np.full(2, FREE_PAIR_SHARE * _ANYWHERE_M),
+        sigma_px=np.full(2, FREE_PAIR_SHARE * width),
     )
 
 
