@@ -99,10 +99,10 @@ def run(
     if options.basemap is not None and not exists(options.basemap):
         raise InputError(f"the basemap {address_of(options.basemap)} does not exist; check the path")
     if options.unreferenced:
-        return keep_picture(
-            out, _run(load, out / PART, replace(options, tiles="no"), workers, progress, drawers, publish)
-        )
-    return _run(load, out, options, workers, progress, drawers, publish)
+        apart = replace(options, tiles="no")
+        report = _run(load, out / PART, apart, workers, progress, drawers=drawers, publish=None)
+        return keep_picture(out, report)
+    return _run(load, out, options, workers, progress, drawers=drawers, publish=publish)
 
 
 def _run(
@@ -111,6 +111,7 @@ def _run(
     options: MapOptions,
     workers: Workers,
     progress: Progress,
+    *,
     drawers: Workers | None,
     publish: Callable[[], None] | None,
 ) -> dict[str, Any]:
