@@ -47,6 +47,7 @@ _LARGEST_BYTES: Final = 50_000_000
 _SHAPEFILE: Final = b"\x00\x00\x27\x0a"
 _ROUTE: Final = "waylines.wpml"
 _GEOJSON: Final = (".geojson", ".json")
+_OPENAIR: Final = re.compile(r"^AC +\S", re.MULTILINE)  # the class of an airspace begins each
 _SQLITE: Final = b"SQLite format 3\0"
 
 
@@ -126,6 +127,8 @@ def _kind(path: Path, name: str) -> str:
         return "KML"
     if text.startswith(("{", "[")):
         return "a mission" if _is_mission(text, name) else "GeoJSON"
+    if _OPENAIR.search(text):
+        raise InputError(f"{name} is OpenAir, which is not read; get the zones as ED-269, ED-318, GeoJSON or KML")
     kinds = "GeoJSON, KML, KMZ, zipped shapefile, GeoPackage, a .plan nor a .waypoints mission"
     raise InputError(f"{name} holds neither {kinds}; export the polygon again")
 
@@ -334,6 +337,9 @@ def read_no_fly(paths: Sequence[Path], flown: Ring, clearance_m: float | None) -
             )
         if far:
             notes.append(f"of {path.name}, {', '.join(counted({'zone': far}))} far from the flights: not used")
+        holes = sum(len(p.holes) for p in near.polygons)
+        if holes:
+            notes.append(f"{', '.join(counted({'hole': holes}))} in zones of {path.name}: not flown either")
         rings += [p.shell for p in near.polygons] + [c.polygon(beyond_m).shell for c in near.circles] + file.no_fly
         fences += file.fences
         fences += [Fence(inclusion=False, points=((c.lat_deg, c.lon_deg),), radius_m=c.radius_m) for c in near.circles]

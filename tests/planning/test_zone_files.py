@@ -272,3 +272,18 @@ def test_aixm_is_named_with_what_to_do(tmp_path):
     (tmp_path / "zones.xml").write_text(text)
     with pytest.raises(InputError, match=r"is AIXM.*convert them"):
         read_zones(tmp_path / "zones.xml")
+
+
+def test_openair_is_named_with_what_to_do(tmp_path):
+    (tmp_path / "zones.txt").write_text("* Swiss zones\nAC R\nAN LS-R4\nAH FL130\nAL GND\nDP 47:23:00 N 008:32:00 E\n")
+    with pytest.raises(InputError, match=r"is OpenAir.*ED-269"):
+        read_zones(tmp_path / "zones.txt")
+
+
+def test_a_hole_in_a_zone_is_not_flown_and_is_named(tmp_path):
+    outer = np.array([[47.4, 8.5], [47.4, 8.51], [47.41, 8.51], [47.41, 8.5]])
+    rings = [[[lon, lat] for lat, lon in ring] for ring in (outer, 0.5 * (outer + outer.mean(0)))]
+    (tmp_path / "zones.json").write_text(json.dumps({"type": "Polygon", "coordinates": [[*r, r[0]] for r in rings]}))
+    found = read_no_fly([tmp_path / "zones.json"], outer, None)
+    assert len(found.rings) == 1 and len(found.rings[0]) == 4
+    assert found.notes == ["a hole in zones of zones.json: not flown either"]
