@@ -4,10 +4,11 @@ import io
 import os
 import re
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,11 @@ from orthoswarm.stores.addresses import is_stored
 from orthoswarm.stores.local_copies import content
 from orthoswarm.stores.requests import NotStoredError, StoreRequestError
 
-PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".dng"})
+if TYPE_CHECKING:
+    from rawpy import RawPy
+
+RAW_SUFFIX: Final = ".dng"
+PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", RAW_SUFFIX})
 
 
 MOST_PIXELS: Final = 200_000_000
@@ -164,7 +169,7 @@ def _bytes(path: Path) -> bytes:
             raise PictureError.of(path, f"has {width} x {height} pixels, more than any camera; leave it out")
         return data
     try:
-        picture_size(data)
+        (raw_size if path.suffix.lower() == RAW_SUFFIX else picture_size)(data)
     except PictureError as error:
         raise PictureError.of(path, error.reason.removeprefix("it ")) from None
     return data
@@ -190,9 +195,51 @@ def _content(path: Path) -> bytes:
         raise PictureError.of(path, f"cannot be read ({error.strerror}); check the file") from None
 
 
+def raw_size(data: bytes) -> tuple[int, int]:
+    """Columns and rows of a raw picture (DNG) as it is developed.
+
+    Raises:
+        PictureError: the extra "raw" is not installed, or the file is damaged or larger than MOST_PIXELS.
+    """
+    with _opened_raw(data) as raw:
+        width, height = raw.sizes.width, raw.sizes.height
+    if width * height > MOST_PIXELS:
+        raise PictureError(f"it has {width} x {height} pixels, more than any camera; leave it out")
+    return width, height
+
+
+def _developed(data: bytes) -> Bytes:
+    """The colours of a raw picture, blue first, all pictures by the same curve."""
+    with _opened_raw(data) as raw:
+        import rawpy
+
+        linear = rawpy.DemosaicAlgorithm.LINEAR  # a third of the usual one's time
+        rgb = raw.postprocess(demosaic_algorithm=linear, use_camera_wb=True, no_auto_bright=True, user_flip=0)
+    return np.ascontiguousarray(rgb[..., ::-1])
+
+
+@contextmanager
+def _opened_raw(data: bytes) -> "Iterator[RawPy]":
+    try:
+        import rawpy
+    except ImportError:
+        raise PictureError(
+            "it is a raw picture (DNG), which needs the extra 'raw'; pip install 'orthoswarm[raw]', or use the JPEG of "
+            "the same exposure"
+        ) from None
+    try:
+        with rawpy.imread(io.BytesIO(data)) as raw:
+            yield raw
+    except rawpy.LibRawError:
+        raise PictureError("it is a raw picture that cannot be developed; copy it again from the camera") from None
+
+
 def _decode_other(path: Path, data: bytes, *, gray: bool) -> Bytes:
     import cv2
 
+    if path.suffix.lower() == RAW_SUFFIX:
+        picture = _developed(data)
+        return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)) if gray else picture
     flags = (cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR) | cv2.IMREAD_IGNORE_ORIENTATION
     image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_ANYDEPTH) if data else None
     if image is not None and image.dtype == np.uint16:

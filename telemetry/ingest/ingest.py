@@ -16,6 +16,7 @@ from typing import Final
 from orthoswarm.model.earth import distance_m
 from orthoswarm.model.frame import UNSTATED_SIGMA_M, Ingest, Rejection
 from orthoswarm.model.task_runner import Progress
+from orthoswarm.raster.picture_file import RAW_SUFFIX
 from orthoswarm.stores.local_copies import local_file
 from telemetry.formats.table import geo_txt, pose_csv
 from telemetry.formats.table.pose_table import PoseTable, leave_out_folder, lookup, names_of, take_base_names
@@ -261,9 +262,13 @@ def _photo_folder(
     named = folder.path.name if folder.path == found.root else found.name(folder.path)
     source = SourceInfo(path=named, kind="photos")
     groups: dict[str, list[Photo]] = {}
-    seen, moved_m = 0, list[float]()
+    seen, moved_m, twice = 0, list[float](), 0
+    finished = {path.with_suffix("") for path in folder.pictures if path.suffix.lower() != RAW_SUFFIX}
     for path, photo in zip(folder.pictures, tags, strict=True):
         if photo is None:
+            continue
+        if path.suffix.lower() == RAW_SUFFIX and path.with_suffix("") in finished:
+            twice += 1
             continue
         seen += 1
         name = found.name(path)
@@ -274,6 +279,9 @@ def _photo_folder(
             photo = _with_sidecar(photo, folder.sidecars[path], found, source)
         vehicle = _merge_tables(photo, path, tables, moved_m) or folder.vehicle
         groups.setdefault(vehicle, []).append(photo)
+    if twice:
+        text = f"{plural(twice, 'raw picture')} not used: a finished picture of the same exposure lies beside each"
+        source.findings.append(Finding("raw-pictures", text, note=True))
     if moved_m:
         text = (
             f"tables put {plural(len(moved_m), 'picture')} up to {max(moved_m) / 1000:.1f} km from where its tags or "

@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from orthoswarm.model.earth import distance_m
+from orthoswarm.raster.picture_file import PictureError, raw_size
 from orthoswarm.stores.addresses import is_stored
 from orthoswarm.stores.listing import StoredFile, known
-from orthoswarm.stores.local_copies import expect
+from orthoswarm.stores.local_copies import content, expect
 from orthoswarm.stores.requests import CONNECTIONS
 from telemetry.formats.photo import exif, xmp
 from telemetry.formats.photo.exif import parse_dji
@@ -95,7 +96,10 @@ def read_photo(path: Path) -> Photo | None:
     if b"GPano:ProjectionType" in (container.xmp or b""):
         raise NotAPicture("a panorama, which no single camera sees; use the photos that it was made of")
     if container.raw:
-        raise NotAPicture("a raw picture (DNG) cannot be mapped; use the JPEG of the same exposure or develop it first")
+        try:
+            container.width, container.height = raw_size(content(path))
+        except PictureError as error:
+            raise NotAPicture(str(error)) from None
     return tags_of(path, container)
 
 
