@@ -41,6 +41,7 @@ from gcs_plugin.daemon.store.daemon_events import Events
 from gcs_plugin.daemon.store.journal import Journal, all_changes, drawn_forgotten, fact_change, statement
 from gcs_plugin.daemon.store.people_rows import People, Pilots
 from gcs_plugin.daemon.store.picture_store import KeptPictures, PictureStore
+from gcs_plugin.daemon.survey_points import SurveyPoints
 from gcs_plugin.daemon.takeoffs import Takeoffs
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.views import Views
@@ -172,6 +173,7 @@ class Daemon:
             settings, self.journal, store=self.store, layers=self.layers, console=self.console, drawer=self.drawer,
             views=self.views, coverage=self.coverage, facts=facts, people=self.people,
         )  # fmt: skip
+        self.points = SurveyPoints(self.journal, self.events, self.exports)
         self.changes = GroundChanges(settings, self.journal, self.store)
         self.getting_ready = GettingReady(self.events)
         self.tak = TakFeed([settings.tak_address(text) for text in settings.tak], self.exports)

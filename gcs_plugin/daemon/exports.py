@@ -50,6 +50,7 @@ from orthoswarm.export.tactical.places import Place, sightings
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.placement import PlacedFrame
 from orthoswarm.raster import picture_file
 
 _SHOWN: Final = (".jpg", ".webp", ".bmp")  # by all browsers
@@ -180,6 +181,17 @@ class Exports:
             row["seq"] = frame_number(self._journal, row["vehicle"], row["image"])
         return rows
 
+    def placed(self) -> tuple[list[PlacedFrame], float, LocalGrid]:
+        """Where the pictures are now, on which level of the ground, metres, and in which grid.
+
+        Raises:
+            InputError: there is no map yet.
+        """
+        area = self._drawer.area
+        if area is None:
+            raise InputError("there is no map yet; wait for pictures")
+        return (*_placed_of(self._task(area)), LocalGrid(area.epsg))
+
     def picture(self, seq: int) -> Path:
         """The file of a picture; raises InputError: there is no such picture."""
         name = frame_path(self._journal, seq)
@@ -255,10 +267,13 @@ def _name(find: FindRow) -> str:
     return note.splitlines()[0][:60] if note else f"Find {find['id']}"
 
 
+def _placed_of(task: ExportTask) -> tuple[list[PlacedFrame], float]:
+    return placements(task, [read_solution(path).solution for path in (*task.coarse, *task.solutions)])
+
+
 def pictures_at(task: ExportTask, lat_deg: float, lon_deg: float) -> list[SightingRow]:
     """The pictures that show a place, best first, as JSON values, see `SightingRow`."""
-    solutions = [read_solution(path).solution for path in (*task.coarse, *task.solutions)]
-    placed, level = placements(task, solutions)
+    placed, level = _placed_of(task)
     grid = LocalGrid(task.epsg)
     east, north = (float(v) for v in grid.to_grid(lat_deg, lon_deg))
 

@@ -20,7 +20,7 @@ from gcs_plugin.daemon.layers.realtime_layer import LATENCY_S
 from gcs_plugin.daemon.layers.web_tiles import TileAddress
 from gcs_plugin.daemon.store.frame_rows import stage_counts
 from gcs_plugin.daemon.store.job_rows import job_counts
-from gcs_plugin.web.answers import JsonAnswer, in_thread, install_error_answers, json_body, parse_json
+from gcs_plugin.web.answers import JsonAnswer, body_of, in_thread, install_error_answers, json_body, parse_json
 from gcs_plugin.web.assets import Assets, Packed
 from gcs_plugin.web.command_routes import CommandRoutes
 from gcs_plugin.web.event_stream import Standstill, stream_events
@@ -36,6 +36,7 @@ from orthoswarm.report.trust import trust_overlay
 Result = TypeVar("Result")
 STATIC: Final = Path(__file__).parent / "static"
 _TYPES: Final = {"webp": "image/webp", "png": "image/png"}
+_MOST_TABLE: Final = 1_000_000  # bytes of a table of surveyed points
 _QUANTILES: Final = (0.5, 0.9, 0.99, 1)
 
 
@@ -79,6 +80,11 @@ def calls(daemon: Daemon) -> list[Call]:
         Call("/api/finds", "add_find", console.add_find,
              "Mark a find: `lat_deg`, `lon_deg`, `sigma_m`, `note`; `time` (ISO 8601) if it was marked before now.",
              "POST", 201),
+        Call("/api/points", "points", daemon.points.rows,
+             "Surveyed points with their marks in pictures, and how well these fit: `off_m`, `rays_miss_m`, `off_px`."),
+        Call("/api/points/marks", "mark_point", daemon.points.mark,
+             'Mark a point in a picture: {"name": N, "seq": S, "column": C, "row": R}; null for both takes it away.',
+             "POST"),
         Call("/api/coverage/vehicles", "vehicles", daemon.gap_flights.vehicles,
              "Vehicles that could fly the gaps: battery, minutes left (null: unknown), and why one cannot at present."),
         Call("/api/coverage/flight", "flight", daemon.gap_flights.plan,
@@ -292,6 +298,22 @@ class HttpRoutes:
         """The pictures that show a find, best first, see `SightingRow`."""
         return JsonAnswer(await self.work(self.daemon.exports.find_pictures, number))
 
+    async def load_points(
+        self, request: Request, name: str = Query("points.csv", description="the file's name, for messages")
+    ) -> Response:
+        """Replace the surveyed points by those of a table, sent as the body: gcp_list.txt or CSV (docs/usage.md)."""
+        table = await body_of(request, _MOST_TABLE)
+        return JsonAnswer(await self.work(self.daemon.points.load, table, name[:100]))
+
+    async def point_pictures(self, name: str = Query(...)) -> Response:
+        """The pictures that show a surveyed point, best first, see `SightingRow`."""
+        return JsonAnswer(await self.work(self.daemon.points.pictures, name))
+
+    async def gcp_list(self) -> Response:
+        """The marks as ODM's gcp_list.txt, for `mosaic --control` and other programs."""
+        headers = {"Content-Disposition": 'attachment; filename="gcp_list.txt"'}
+        return Response(await self.work(self.daemon.points.gcp_list), media_type="text/plain", headers=headers)
+
     async def place_pictures(
         self, lat_deg: float = Query(ge=-90.0, le=90.0), lon_deg: float = Query(ge=-180.0, le=180.0)
     ) -> Response:
@@ -387,6 +409,9 @@ def make_app(daemon: Daemon, access: Access, address: str = "") -> Any:
     add("/api/plan", routes.console_plan)
     add("/api/finds/{number}/pictures", routes.find_pictures)
     add("/api/pictures", routes.place_pictures)
+    add("/api/points", routes.load_points, methods=["PUT"])
+    add("/api/points/pictures", routes.point_pictures)
+    add("/api/points/gcp_list.txt", routes.gcp_list)
     add("/api/frames/{seq}/picture", routes.picture)
     add("/api/frames/{seq}/view", routes.picture_view)
     add("/api/places", routes.places)

@@ -55,7 +55,8 @@ _READING: Final = """
     /api/vehicles /api/layers /api/jobs /api/legs
     /api/completions /api/frames /api/routes /api/frames/{seq}/picture /api/frames/{seq}/view /api/plans
     /api/plans/{number}/map /api/plans/{number}/files/{drone} /api/plan /api/traffic /api/finds
-    /api/finds/{number}/pictures /api/pictures /api/places /api/trust /api/trust.png /api/change /api/change.png
+    /api/finds/{number}/pictures /api/pictures /api/points /api/points/pictures /api/points/gcp_list.txt
+    /api/places /api/trust /api/trust.png /api/change /api/change.png
     /api/coverage /api/coverage/gaps.geojson /api/coverage/cells.png /api/coverage/vehicles
     /api/export/{job}/{kind} /api/holds /api/log
 """
@@ -73,6 +74,8 @@ NEEDS: Final[dict[str, Need]] = {
     "POST /api/finds": Need(Role.ANALYST, "find"),
     "PUT /api/finds/{number}": Need(Role.ANALYST, "change find"),
     "DELETE /api/finds/{number}": Need(Role.ANALYST, "remove find"),
+    "PUT /api/points": Need(Role.ANALYST, "load points"),
+    "POST /api/points/marks": Need(Role.ANALYST, "mark point"),
     "POST /api/refine": Need(Role.ANALYST, "refine"),
     "POST /api/export": Need(Role.ANALYST, "export"),
     # vehicles

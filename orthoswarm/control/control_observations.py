@@ -85,7 +85,7 @@ def in_photos(
         photos = _photos(point, images)
         if not photos:
             continue
-        rays = [_ray(p, pixel, RECEIVERS_LOCAL_SIGMA_M if not on_map else p.sigma_m) for p, pixel in photos]
+        rays = [pixel_ray(p, pixel, RECEIVERS_LOCAL_SIGMA_M if not on_map else p.sigma_m) for p, pixel in photos]
         level = float(np.median([terrain.height(p.camera.nadir) for p, _ in photos]))
         place = intersect_rays(rays, level, _HEIGHT_SIGMA_M).place
         met = intersect_rays(rays, float(terrain.height(place)), _HEIGHT_SIGMA_M)
@@ -135,8 +135,8 @@ def _leaning_m(rays: Sequence[Ray]) -> float:
     return _HEIGHT_SIGMA_M * float(np.hypot(east, north) / max(abs(up), 1e-3))
 
 
-def _ray(placed: PlacedFrame, pixel: Array, camera_sigma_m: float) -> Ray:
-    """The ray of a pixel."""
+def pixel_ray(placed: PlacedFrame, pixel: Array, camera_sigma_m: float) -> Ray:
+    """The ray of a pixel, column and row (2,), of a picture whose camera may be so far off others, metres."""
     camera = placed.camera
     below = float(camera.position[2]) - 1.0
     away = np.array([*camera.to_ground(pixel, below), below]) - camera.position

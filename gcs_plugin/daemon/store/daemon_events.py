@@ -151,11 +151,11 @@ class LayerPublished(Event):
 
 PageKind = Literal[
     "command", "completion", "coverage", "finds", "frame", "holds", "job", "layer", "log", "note", "overload", "people",
-    "plan", "problem", "refused", "requests", "traffic", "vehicle", "vehicle_event",
+    "plan", "points", "problem", "refused", "requests", "traffic", "vehicle", "vehicle_event",
 ]  # fmt: skip
 """What pages alone are told: outcomes of commands and of refinements after completions, gaps, finds, pictures as they
-are drawn or refused, who has which vehicle, jobs, pixels of the real-time layer, sentences for the operator, other
-aircraft, changed values of a vehicle's row, and events of the fleet."""
+are drawn or refused, surveyed points, who has which vehicle, jobs, pixels of the real-time layer, sentences for the
+operator, other aircraft, changed values of a vehicle's row, and events of the fleet."""
 
 
 @dataclass(frozen=True, slots=True)

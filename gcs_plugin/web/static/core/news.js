@@ -114,7 +114,7 @@ function soon(...paths) {
 }
 
 const KINDS = {
-  resync: () => { refresh(); changed("plan"); changed("finds-changed"); },
+  resync: () => { refresh(); changed("plan"); changed("finds-changed"); changed("points-changed"); },
   unwelcome: () => { read("/api/me"); read("/api/vehicles"); },
   vehicle: heard("/api/vehicles", takeVehicle),
   vehicle_event: (event) => {
@@ -138,6 +138,7 @@ const KINDS = {
   completion: () => soon("/api/completions", "/api/vehicles"),
   plan: () => changed("plan"),
   finds: () => changed("finds-changed"),
+  points: () => changed("points-changed"),
   holds: (event) => { state.holds = list(event.rows); changed("holds"); },
   people: () => { changed("people"); soon("/api/me"); },
   log: () => changed("people"),

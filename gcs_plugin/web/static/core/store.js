@@ -17,6 +17,7 @@ export const state = {
   commands: [], // newest first; fly/commands.js
   alarms: new Map(), // key -> alarm; fly/alarms.js
   finds: [],
+  points: [],
   me: null, // who this page is to the station: /api/me
   holds: [], // which pilot has which vehicle: /api/holds
   traffic: [], // other aircraft, as core/values.js cleans them

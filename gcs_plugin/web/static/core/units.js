@@ -23,6 +23,8 @@ export const clock = (seconds) => {
 };
 export const ageText = (seconds) => (seconds == null ? none : seconds < 10 ? `${fixed(seconds, 1)} s` : seconds < 100 ? `${Math.round(seconds)} s` : clock(seconds));
 
+// Errors: to a centimetre.
+export const error = (metres) => (us() ? show(metres / FOOT, 2, "ft") : show(metres, 2, "m"));
 export function distance(metres) {
   if (metres == null) return none;
   if (us()) return metres < 1609.344 ? `${fixed(metres / FOOT, 0)} ft` : `${fixed(metres / 1609.344, 2)} mi`;

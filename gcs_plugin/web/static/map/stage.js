@@ -25,6 +25,7 @@ import { loadPlan, planPanel } from "/static/plan/panel.js";
 import { olderNote } from "/static/plan/result.js";
 import { exportPanel } from "/static/work/exports.js";
 import { findPanel, loadFinds } from "/static/work/finds.js";
+import { loadPoints, pointPanel } from "/static/work/points.js";
 import { jobPanel } from "/static/work/jobs.js";
 import { gapFlightDialog } from "/static/coverage/flight.js";
 import { coveragePanel } from "/static/coverage/panel.js";
@@ -53,13 +54,15 @@ export async function withMap(panels) {
   const compare = () => { if (!swipe.checked) swipe.click(); };
   byId("stage").append(...swipeParts(), olderNote(), make("div", { class: "under" }, button(t("map.all"), showAll), ...shownBox(), cursorLine()), detailsPanel());
   panels.plan.append(planPanel());
-  panels.map.append(goToForm(), layerPanel(), make("section", {}, make("label", { class: "check" }, swipe, make("span", {}, t("swipe.on")))), changePanel(compare), coveragePanel(), trustPanel(), legPanel(), measurePanel(), findPanel(), jobPanel(), exportPanel());
+  panels.map.append(goToForm(), layerPanel(), make("section", {}, make("label", { class: "check" }, swipe, make("span", {}, t("swipe.on")))), changePanel(compare), coveragePanel(), trustPanel(), legPanel(), measurePanel(), findPanel(), pointPanel(), jobPanel(), exportPanel());
   document.body.append(preflightDialog(), gapFlightDialog());
   await ready;
   subscribe("plan", "the shared plan", () => loadPlan());
   subscribe("finds-changed", "finds of others", () => loadFinds());
+  subscribe("points-changed", "points of others", () => loadPoints());
   guarded("the plan", loadPlan)();
   guarded("finds", loadFinds)();
+  guarded("points", loadPoints)();
   window.orthoswarm = { map };
   return { setEditing };
 }

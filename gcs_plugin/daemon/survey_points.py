@@ -1,0 +1,190 @@
+"""Surveyed points that people mark in pictures on the page, and how well the pictures' places fit them.
+
+A point's table is read as those of `mosaic --control` are. Where a picture should show a point follows from the
+picture's place; where it does is marked. What is marked is written as ODM's gcp_list.txt.
+"""
+
+import tempfile
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final, TypedDict
+
+import numpy as np
+
+from gcs_plugin.daemon.exports import Exports, SightingRow
+from gcs_plugin.daemon.store.daemon_events import Events
+from gcs_plugin.daemon.store.frame_rows import all_frames
+from gcs_plugin.daemon.store.journal import Journal
+from orthoswarm.control.control_observations import pixel_ray
+from orthoswarm.evaluation.checkpoints import RECEIVERS_LOCAL_SIGMA_M, Mark, read_checkpoints
+from orthoswarm.evaluation.misread_points import away_m
+from orthoswarm.evaluation.point_rays import intersect_rays, intersection
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.placement import PlacedFrame
+
+_MOST_POINTS: Final = 1000
+_SAME_PLACE_M: Final = 0.02  # a table that is read again keeps the marks of points that are the same
+
+
+class MarkRow(TypedDict):
+    """Where a picture (`seq`, `vehicle`, `image`) shows a point, pixels; `off_px`: from where all marks put it."""
+
+    seq: int
+    vehicle: str
+    image: str
+    column: float
+    row: float
+    off_px: float | None
+
+
+class PointRow(TypedDict):
+    """A surveyed point.
+
+    marks: where it was marked. off_m: east and north from the survey to where the marks put it. rays_miss_m: root mean
+    square by which their rays miss each other. Both are null without marks in pictures that have a place, the last with
+    fewer than two. findings: what is wrong with the marks.
+    """
+
+    name: str
+    lat_deg: float
+    lon_deg: float
+    marks: list[MarkRow]
+    off_m: list[float] | None
+    rays_miss_m: float | None
+    findings: list[str]
+
+
+class SurveyPoints:
+    """The points and their marks, in the journal; `exports`: knows where the pictures are."""
+
+    def __init__(self, journal: Journal, events: Events, exports: Exports) -> None:
+        self._journal, self._events, self._exports = journal, events, exports
+        self._lock = threading.Lock()
+
+    def rows(self) -> list[PointRow]:
+        """The points in the order of their table."""
+        points = self._points()
+        seqs = {int(seq) for point in points for seq in point["marks"]}
+        names = {row.seq: (row.vehicle, row.image) for row in all_frames(self._journal) if row.seq in seqs}
+        found = [_row(point, names) for point in points]
+        if seqs:
+            frames, level, grid = self._exports.placed()
+            placed = {(p.frame.vehicle, p.frame.image): p for p in frames}
+            for row in found:
+                _measure(row, placed, level, grid)
+        return found
+
+    def load(self, table: bytes, name: str) -> list[PointRow]:
+        """Replace the points by those of a table (gcp_list.txt or CSV, see evaluation.checkpoints).
+
+        Marks of points that are in both stay; those of the table are taken where a picture has that name.
+
+        Raises:
+            InputError: it cannot be read, or holds too many.
+        """
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / (Path(name).name or "points.csv")
+            path.write_bytes(table)
+            read = read_checkpoints(path)
+        if len(read) > _MOST_POINTS:
+            raise InputError(f"{name} holds {len(read)} points; send at most {_MOST_POINTS}")
+        seqs = {row.image: row.seq for row in all_frames(self._journal)} if any(p.marks for p in read) else {}
+        with self._lock:
+            known = {point["name"]: point for point in self._points()}
+            points = []
+            for point in read:
+                marks = {str(seqs[m.image]): [m.column, m.row] for m in point.marks if m.image in seqs}
+                lon, lat = (float(v) for v in point.surveyed)
+                old = known.get(point.name)
+                if (
+                    old is not None
+                    and away_m(np.array([old["lon_deg"], old["lat_deg"]]), point.surveyed) < _SAME_PLACE_M
+                ):
+                    marks = old["marks"] | marks
+                points.append({"name": point.name, "lat_deg": lat, "lon_deg": lon, "marks": marks})
+            self._journal.remember("points", points)
+        self._events.tell("points")
+        return self.rows()
+
+    def mark(self, body: Mapping[str, Any]) -> list[PointRow]:
+        """Mark a point (`name`) in a picture (`seq`) at `column` and `row`, or not any more where these are null.
+
+        Raises:
+            InputError: there is no such point or picture, or the mark lies outside it.
+        """
+        seq = body.get("seq")
+        at: tuple[Any, Any] = (body.get("column"), body.get("row"))
+        frame = next((row for row in all_frames(self._journal) if row.seq == seq), None)
+        if frame is None:
+            raise InputError(f"there is no picture {seq}; see /api/frames")
+        with self._lock:
+            points = self._points()
+            point = next((point for point in points if point["name"] == body.get("name")), None)
+            if point is None:
+                raise InputError(f"there is no point {body.get('name')}; see /api/points")
+            if at == (None, None):
+                point["marks"].pop(str(seq), None)
+            elif all(isinstance(v, int | float) and not isinstance(v, bool) and np.isfinite(v) for v in at):
+                Mark(frame.image, *at).check_inside(*frame.size)
+                point["marks"][str(seq)] = [float(v) for v in at]
+            else:
+                raise InputError("column and row are not pixels; send numbers, or null to take the mark away")
+            self._journal.remember("points", points)
+        self._events.tell("points")
+        return self.rows()
+
+    def pictures(self, name: str) -> list[SightingRow]:
+        """The pictures that show a point, best first, see `SightingRow`. Raises InputError: there is no such point."""
+        point = next((point for point in self._points() if point["name"] == name), None)
+        if point is None:
+            raise InputError(f"there is no point {name}; see /api/points")
+        return self._exports.pictures_of(point["lat_deg"], point["lon_deg"])
+
+    def gcp_list(self) -> str:
+        """The marks as ODM's gcp_list.txt; heights are not known."""
+        lines = [
+            f"{row['lon_deg']:.9f} {row['lat_deg']:.9f} NaN {mark['column']:.2f} {mark['row']:.2f} {mark['image']} "
+            + "_".join(row["name"].split())
+            for row in self.rows()
+            for mark in row["marks"]
+        ]
+        return "\n".join(["EPSG:4326", *lines, ""])
+
+    def _points(self) -> list[dict[str, Any]]:
+        found: list[dict[str, Any]] = self._journal.fact("points") or []
+        return found
+
+
+def _row(point: Mapping[str, Any], names: Mapping[int, tuple[str, str]]) -> PointRow:
+    """A point as it is stored; names: vehicle and image of pictures by seq."""
+    marks = [
+        MarkRow(seq=int(seq), vehicle=names[int(seq)][0], image=names[int(seq)][1], column=u, row=v, off_px=None)
+        for seq, (u, v) in point["marks"].items()
+        if int(seq) in names
+    ]
+    return PointRow(
+        name=point["name"], lat_deg=point["lat_deg"], lon_deg=point["lon_deg"], marks=marks, off_m=None,
+        rays_miss_m=None, findings=[],
+    )  # fmt: skip
+
+
+def _measure(row: PointRow, placed: Mapping[tuple[str, str], PlacedFrame], level: float, grid: LocalGrid) -> None:
+    """Fill in what the marks say of a point; level: of the ground, metres."""
+    seen = [(mark, p) for mark in row["marks"] if (p := placed.get((mark["vehicle"], mark["image"]))) is not None]
+    if not seen:
+        return
+    rays = [
+        pixel_ray(p, np.array([mark["column"], mark["row"]]), p.sigma_m or RECEIVERS_LOCAL_SIGMA_M) for mark, p in seen
+    ]
+    met = intersect_rays(rays, level)
+    off = met.place - grid.to_grid(row["lat_deg"], row["lon_deg"])
+    row["off_m"], row["findings"] = [round(float(v), 3) for v in off], met.findings(row["name"])
+    if len(seen) < 2:
+        return
+    row["rays_miss_m"] = round(met.miss_m, 3)
+    place = intersection([(ray.position, ray.direction) for ray in rays], level)
+    for mark, p in seen:
+        u, v = p.camera.project(place[None])[0].tolist()
+        mark["off_px"] = round(float(np.hypot(u - mark["column"], v - mark["row"])), 2)
