@@ -42,7 +42,7 @@ export function pointPanel() {
   const list = make("ul", { class: "finds" });
   const about = make("p", { class: "quiet" }, t("points.none"));
   const save = make("a", { download: "gcp_list.txt" }, t("points.save"));
-  const saved = make("ul", { class: "files" }, make("li", {}, save));
+  const saved = make("p", { class: "points-file" }, save);
   const draw = keyedList(list, (row) => make("li", {}, button("", () => show(row.name), { class: "find" }), make("small", {})), (line, row) => {
     setText(line.firstChild, text(row.name));
     setText(line.lastChild, [aboutPoint(row), ...row.findings].join("; "));
