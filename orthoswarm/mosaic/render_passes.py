@@ -193,9 +193,10 @@ def label_pass(task: LabelTask) -> list[tuple[int, Window]]:
             shots=task.shots,
             seams=task.seams,
         )
-    marks = np.arange(1, len(task.ids) + 1, dtype=np.int32)
-    lattice = place.heights(task.key, task.terrain)
-    label_tile(local, task.shots, marks, lattice=lattice, west=west, north=north, gsd_m=place.grid.gsd_m)
+    if not local.all():
+        marks = np.arange(1, len(task.ids) + 1, dtype=np.int32)
+        lattice = place.heights(task.key, task.terrain)
+        label_tile(local, task.shots, marks, lattice=lattice, west=west, north=north, gsd_m=place.grid.gsd_m)
     boxes = label_windows(local, len(task.ids))
     won = np.nonzero(boxes[:, 4])[0]
     if len(won):
@@ -222,7 +223,10 @@ def feather_pass(task: FeatherTask) -> list[tuple[int, Window]]:
 
     To be called once all tiles are labelled.
     """
-    other, share = transition(labels_around(task.place.store(), task.key, task.width_px), task.width_px)
+    around = labels_around(task.place.store(), task.key, task.width_px)
+    if around.min() == around.max():  # one picture shows all of the tile
+        return []
+    other, share = transition(around, task.width_px)
     rows, cols = task.place.shape(task.key)
     other[rows:], other[:, cols:] = 0, 0
     try:
