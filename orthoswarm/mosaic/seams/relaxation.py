@@ -155,34 +155,35 @@ def to_pixels(label, candidate, cell, border, pixels):  # type: ignore[no-untype
     beyond the tile, to each side. pixels: int32 (rows, columns), the tile; changed where a cell has a label.
     """
     rows, columns = pixels.shape
-    last = label.shape[0] - 1
-    for r in range(rows):
-        y = (r + 0.5) / cell - 0.5 + border
-        i = int(np.floor(y))
-        i0, i1, fy = max(i, 0), min(i + 1, last), y - i
-        own_i = r // cell + border
-        for c in range(columns):
-            x = (c + 0.5) / cell - 0.5 + border
-            j = int(np.floor(x))
-            j0, j1, fx = max(j, 0), min(j + 1, last), x - j
-            own_j = c // cell + border
-            own = label[own_i, own_j]
-            if own < 0:
-                continue
+    last, half = label.shape[0] - 1, cell // 2
+    for i in range(border - 1, border + rows // cell + 1):
+        i0, i1 = max(i, 0), min(i + 1, last)
+        r0, r1 = max((i - border) * cell + half, 0), min((i + 1 - border) * cell + half, rows)
+        for j in range(border - 1, border + columns // cell + 1):
+            j0, j1 = max(j, 0), min(j + 1, last)
+            c0, c1 = max((j - border) * cell + half, 0), min((j + 1 - border) * cell + half, columns)
             a, b, d, e = label[i0, j0], label[i0, j1], label[i1, j0], label[i1, j1]
             if a == b and a == d and a == e:
-                pixels[r, c] = own + 1
+                pixels[r0:r1, c0:c1] = max(a + 1, 0)
                 continue
-            best, most = own, -1.0
-            for k in (own, a, b, d, e):
-                if k < 0:
-                    continue
-                vote = (
-                    (1.0 - fx) * (1.0 - fy) * (a == k)
-                    + fx * (1.0 - fy) * (b == k)
-                    + (1.0 - fx) * fy * (d == k)
-                    + fx * fy * (e == k)
-                )
-                if vote > most + 1e-9 and (k == own or _slot(candidate, own_i, own_j, k) >= 0):
-                    best, most = k, vote
-            pixels[r, c] = best + 1
+            for r in range(r0, r1):
+                fy = (r + 0.5) / cell - 0.5 + border - i
+                for c in range(c0, c1):
+                    fx = (c + 0.5) / cell - 0.5 + border - j
+                    own_i, own_j = r // cell + border, c // cell + border
+                    own = label[own_i, own_j]
+                    if own < 0:
+                        continue
+                    best, most = own, -1.0
+                    for k in (own, a, b, d, e):
+                        if k < 0:
+                            continue
+                        vote = (
+                            (1.0 - fx) * (1.0 - fy) * (a == k)
+                            + fx * (1.0 - fy) * (b == k)
+                            + (1.0 - fx) * fy * (d == k)
+                            + fx * fy * (e == k)
+                        )
+                        if vote > most + 1e-9 and (k == own or _slot(candidate, own_i, own_j, k) >= 0):
+                            best, most = k, vote
+                    pixels[r, c] = best + 1
