@@ -76,7 +76,7 @@ class SurveyPoints:
                 _measure(row, placed, level, grid)
         return found
 
-    def load(self, table: bytes, name: str) -> list[PointRow]:
+    def load(self, table: bytes) -> list[PointRow]:
         """Replace the points by those of a table (gcp_list.txt or CSV, see evaluation.checkpoints).
 
         Marks of points that are in both stay; those of the table are taken where a picture has that name.
@@ -85,11 +85,11 @@ class SurveyPoints:
             InputError: it cannot be read, or holds too many.
         """
         with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / (Path(name).name or "points.csv")
+            path = Path(folder) / "the table"
             path.write_bytes(table)
             read = read_checkpoints(path)
         if len(read) > _MOST_POINTS:
-            raise InputError(f"{name} holds {len(read)} points; send at most {_MOST_POINTS}")
+            raise InputError(f"the table holds {len(read)} points; send at most {_MOST_POINTS}")
         seqs = {row.image: row.seq for row in all_frames(self._journal)} if any(p.marks for p in read) else {}
         with self._lock:
             known = {point["name"]: point for point in self._points()}
@@ -97,11 +97,8 @@ class SurveyPoints:
             for point in read:
                 marks = {str(seqs[m.image]): [m.column, m.row] for m in point.marks if m.image in seqs}
                 lon, lat = (float(v) for v in point.surveyed)
-                old = known.get(point.name)
-                if (
-                    old is not None
-                    and away_m(np.array([old["lon_deg"], old["lat_deg"]]), point.surveyed) < _SAME_PLACE_M
-                ):
+                old = known.get(point.name, {"lon_deg": np.inf, "lat_deg": np.inf, "marks": {}})
+                if away_m(np.array([old["lon_deg"], old["lat_deg"]]), point.surveyed) < _SAME_PLACE_M:
                     marks = old["marks"] | marks
                 points.append({"name": point.name, "lat_deg": lat, "lon_deg": lon, "marks": marks})
             self._journal.remember("points", points)
@@ -143,12 +140,18 @@ class SurveyPoints:
         return self._exports.pictures_of(point["lat_deg"], point["lon_deg"])
 
     def gcp_list(self) -> str:
-        """The marks as ODM's gcp_list.txt; heights are not known."""
+        """The marks as ODM's gcp_list.txt; heights are not known.
+
+        Raises:
+            InputError: a picture's name has a blank, which ends a name there.
+        """
+        marks = [(row, mark) for row in self.rows() for mark in row["marks"]]
+        if blank := next((mark["image"] for _, mark in marks if len(mark["image"].split()) != 1), None):
+            raise InputError(f"{blank} has a blank in its name, which gcp_list.txt cannot hold; take away its mark")
         lines = [
             f"{row['lon_deg']:.9f} {row['lat_deg']:.9f} NaN {mark['column']:.2f} {mark['row']:.2f} {mark['image']} "
             + "_".join(row["name"].split())
-            for row in self.rows()
-            for mark in row["marks"]
+            for row, mark in marks
         ]
         return "\n".join(["EPSG:4326", *lines, ""])
 

@@ -298,12 +298,10 @@ class HttpRoutes:
         """The pictures that show a find, best first, see `SightingRow`."""
         return JsonAnswer(await self.work(self.daemon.exports.find_pictures, number))
 
-    async def load_points(
-        self, request: Request, name: str = Query("points.csv", description="the file's name, for messages")
-    ) -> Response:
+    async def load_points(self, request: Request) -> Response:
         """Replace the surveyed points by those of a table, sent as the body: gcp_list.txt or CSV (docs/usage.md)."""
         table = await body_of(request, _MOST_TABLE)
-        return JsonAnswer(await self.work(self.daemon.points.load, table, name[:100]))
+        return JsonAnswer(await self.work(self.daemon.points.load, table))
 
     async def point_pictures(self, name: str = Query(...)) -> Response:
         """The pictures that show a surveyed point, best first, see `SightingRow`."""

@@ -1,5 +1,7 @@
 """Surveyed points: loaded from a table, marked in pictures, measured at once, and written as gcp_list.txt."""
 
+from dataclasses import replace
+
 import httpx
 import numpy as np
 import pytest
@@ -25,8 +27,8 @@ def shots(served):
     return shots
 
 
-def put(served, table, name="points.csv"):
-    return httpx.put(f"{served.url}/api/points?name={name}", content=table, headers=served.auth, trust_env=False)
+def put(served, table):
+    return httpx.put(f"{served.url}/api/points", content=table, headers=served.auth, trust_env=False)
 
 
 def mark(served, **body):
@@ -58,6 +60,13 @@ def test_points_are_marked_and_measured_and_come_out_as_gcp_list(served, shots, 
     assert sorted((m.image, m.column) for m in point.marks) == [
         (m["image"], pytest.approx(m["column"], abs=0.01)) for m in sorted(moved["marks"], key=lambda m: m["image"])
     ]
+    spaced = shots[0].pose["image"].replace(".", " 1.")
+    assert served.send(replace(shots[0], pose=shots[0].pose | {"image": spaced, "vehicle": "v2"})).status_code == 201
+    (other,) = served.get("/api/frames?vehicle=v2").json()
+    assert mark(served, seq=other["seq"], column=5.0, row=5.0).status_code == 200
+    refused = served.get("/api/points/gcp_list.txt")
+    assert refused.status_code == 422 and "has a blank in its name" in refused.text
+    assert mark(served, seq=other["seq"], column=None, row=None).status_code == 200
     less = mark(served, seq=first["seq"], column=None, row=None).json()[0]
     assert len(less["marks"]) == len(seen) - 1
     again = put(served, table).json()  # the same table: the marks stay; what moved has none

@@ -34,7 +34,7 @@ export function pointPanel() {
   const file = make("input", { type: "file", accept: KINDS, class: "hidden-file", "aria-label": t("points.load"), onchange: () => { if (file.files[0]) read(file.files[0]); file.value = ""; } });
   async function read(table) {
     try {
-      take(await request("PUT", `/api/points?name=${encodeURIComponent(table.name)}`, table));
+      take(await request("PUT", "/api/points", table));
     } catch (error) {
       notice("bad", t("points.refused", { why: error.message }));
     }
