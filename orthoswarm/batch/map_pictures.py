@@ -17,6 +17,7 @@ from orthoswarm.export.catalog.tiled_raster import copy_tiled, in_tiles, product
 from orthoswarm.export.cog import write_cog
 from orthoswarm.export.footprint_layer import write_seamlines
 from orthoswarm.export.product_files import describe_frame
+from orthoswarm.export.temperature import TEMPERATURE, write_temperature
 from orthoswarm.export.value_raster import write_confidence
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
@@ -280,6 +281,9 @@ def _write_about(
     found = confidence(*drawn_cells(canvas), placed, terrain, gains)
     write_confidence(run.out / CONFIDENCE, found)
     state.trust = found.figures()
+    if run.options.temperature is not None:
+        scratch, kelvin = run.space.scratch("values"), run.options.temperature
+        write_temperature(run.out / TEMPERATURE, canvas, placed, terrain, kelvin=kelvin, scratch=scratch)
 
 
 def _copy_coarse(run: RunContext, state: RunState) -> None:

@@ -29,6 +29,7 @@ from orthoswarm.evaluation.checkpoints import Checkpoint, read_checkpoints, shar
 from orthoswarm.evaluation.misread_points import require_places
 from orthoswarm.export.atomic_file import disk_error
 from orthoswarm.export.catalog.tiled_raster import product_file
+from orthoswarm.export.temperature import read_temperatures
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.frame import Frame, Ingest, Rejection
@@ -177,6 +178,8 @@ def _load(run: RunContext, load: Load) -> RunState:
         ingest = replace(ingest, warnings=[*ingest.warnings, "--near was not used: every picture has a position"])
     if not ingest.frames:
         raise nothing_to_map(ingest)
+    if run.options.temperature is not None:
+        read_temperatures(ingest.frames[0].path, run.options.temperature)  # refused now, and not when all is drawn
     grid = area_grid(ingest.frames)
     if run.options.split_legs:
         ingest = replace(ingest, frames=legs_as_vehicles(ingest.frames, grid))

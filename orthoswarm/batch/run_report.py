@@ -33,6 +33,7 @@ from orthoswarm.export.product_files import (
     write_frames,
     write_json,
 )
+from orthoswarm.export.temperature import TEMPERATURE
 from orthoswarm.export.value_raster import GROUND, write_ground
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.placement import PlacedFrame, Refinement, Terrain
@@ -47,7 +48,7 @@ def write_products(
     run: RunContext, state: RunState, placed: list[PlacedFrame], refinement: Refinement | None
 ) -> dict[str, Any]:
     """frames.jsonl, footprints and the report."""
-    for name in (*PRODUCTS, UNREFERENCED):  # left by an earlier run with other options
+    for name in (*PRODUCTS, UNREFERENCED, TEMPERATURE):  # left by an earlier run with other options
         if name not in _made(run, state.fault is not None):
             remove_product(run.out, name)
     remove_collection(run.out)
@@ -102,7 +103,7 @@ def _add_checkpoints(run: RunContext, state: RunState, report: dict[str, Any], g
 
 
 def _made(run: RunContext, faulty: bool) -> set[str]:
-    names = set(PRODUCTS)
+    names = set(PRODUCTS) if run.options.temperature is None else {*PRODUCTS, TEMPERATURE}
     if run.options.until != "fine" or faulty:
         names -= {ORTHOIMAGE, SEAMLINES, CONFIDENCE, GROUND}
     if run.options.until == "realtime" or faulty:

@@ -13,6 +13,7 @@ from orthoswarm.config import DEFAULT, Config
 from orthoswarm.control.ground_control import GroundControl
 from orthoswarm.evaluation.checkpoints import Checkpoint
 from orthoswarm.export.catalog.tiled_raster import FOLDER, Tiles, is_tile_or_collection
+from orthoswarm.export.temperature import TEMPERATURE
 from orthoswarm.export.value_raster import GROUND
 from orthoswarm.model.arrays import Bytes, Floats
 from orthoswarm.model.frame import Ingest, Rejection
@@ -50,7 +51,13 @@ PRODUCTS = (
 
 UNREFERENCED = "unreferenced.tif"
 
-WRITTEN = (*PRODUCTS, UNREFERENCED, *(name.replace(".tif", ".vrt") for name in (REALTIME, COARSE, ORTHOIMAGE)), FOLDER)
+WRITTEN = (
+    *PRODUCTS,
+    UNREFERENCED,
+    TEMPERATURE,
+    *(name.replace(".tif", ".vrt") for name in (REALTIME, COARSE, ORTHOIMAGE)),
+    FOLDER,
+)
 """Files and folders that runs write, those of rasters in tiles among them."""
 
 
@@ -78,6 +85,8 @@ class MapOptions:
         blend: mix the two pictures at each seam, see Seams.
         control: surveyed points that move the map onto the ground; checkpoints: others that it is measured at (files
             as of evaluation.checkpoints). pixel_scale: pixels of the photos to one of those in which they were marked.
+        temperature: write `temperature.tif`, of thermal pictures, see export.temperature; kelvin of a count of 16
+            bits, 0 for pictures of 32.
         covariance: write the covariance of each camera's position and rotation to frames.jsonl.
         tiles: write rasters in tiles with a STAC collection: "yes", "no", or "auto" by their pixels.
         quick: draw refined maps at a quarter of the detail, and keep what a run without it goes on from.
@@ -100,6 +109,7 @@ class MapOptions:
     control: Path | None = None
     checkpoints: Path | None = None
     pixel_scale: float = 1.0
+    temperature: float | None = None
     covariance: bool = False
     tiles: Tiles = "auto"
     quick: bool = field(default=False, repr=False)  # no part of a run's key: the other run is the same one

@@ -25,14 +25,14 @@ Others, with 10 to 14 bits, are stretched like maps (half of the range)."""
 _DEPTH_VALUES: Final = 20_000  # about so many values of each of them (for its time)
 
 
-def limits(pictures: list[NDArray[np.uint16]]) -> Range | None:
+def limits(pictures: list[NDArray[Any]]) -> Range | None:
     """Values that become 0 and 255 in pictures; None where they use all 16 bits."""
     values = [picture.ravel()[:: max(1, picture.size // _DEPTH_VALUES)] for picture in pictures]
-    low, high = np.percentile(np.concatenate(values).astype(np.float64), STRETCH_PERCENT)
+    low, high = np.nanpercentile(np.concatenate(values).astype(np.float64), STRETCH_PERCENT)
     return (float(low), float(max(high, low + 1.0))) if high < _DEPTH_FULL else None
 
 
-def kept_range(store: Path, picture: NDArray[np.uint16], suffix: str) -> Range | None:
+def kept_range(store: Path, picture: NDArray[Any], suffix: str) -> Range | None:
     """The range kept for a picture's kind; None where none is kept or all 16 bits are used."""
     found = read_ranges(store).get(_kind(picture, suffix))
     return None if found is None else (float(found[0]), float(found[1]))
@@ -47,7 +47,7 @@ def read_ranges(store: Path) -> dict[str, Any]:
     return document if isinstance(document, dict) else {}
 
 
-def grown(ranges: dict[str, Any], picture: NDArray[np.uint16], suffix: str) -> dict[str, Any] | None:
+def grown(ranges: dict[str, Any], picture: NDArray[Any], suffix: str) -> dict[str, Any] | None:
     """The ranges with that of one more picture; None if they hold it already."""
     kind, used = _kind(picture, suffix), limits([picture])
     if kind not in ranges:
@@ -62,5 +62,5 @@ def grown(ranges: dict[str, Any], picture: NDArray[np.uint16], suffix: str) -> d
     return ranges | {kind: (low - more * (used[0] < kept[0]), high + more * (used[1] > kept[1]))}
 
 
-def _kind(picture: NDArray[np.uint16], suffix: str) -> str:
+def _kind(picture: NDArray[Any], suffix: str) -> str:
     return f"{picture.shape[1]}x{picture.shape[0]}{suffix}"

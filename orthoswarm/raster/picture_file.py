@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,8 @@ take 0.6 GB in colour. A file of some hundred kilobytes can hold a picture that 
 
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
+_TIFF: Final = (b"II*\0", b"MM\0*")
+_DEEP: Final = (np.uint16, np.float32)
 _DEPTH_PICTURES: Final = 9  # pictures of a folder that tell the range of its 16-bit pictures (for its time)
 
 
@@ -241,18 +243,18 @@ def _decode_other(path: Path, data: bytes, *, gray: bool) -> Bytes:
         picture = _developed(data)
         return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)) if gray else picture
     flags = (cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR) | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_ANYDEPTH) if data else None
-    if image is not None and image.dtype == np.uint16:
+    image = _decoded(data, flags)
+    if image is not None and image.dtype in _DEEP:
         folder, suffix = path.parent, path.suffix.lower()
         used = kept_range(folder.parent, image, suffix) if _is_spread(path) else _used_range(folder, suffix)
         if used is not None:
             low, high = used
             scaled = (image.astype(np.float32) - np.float32(low)) * np.float32(255.0 / (high - low))
-            return np.asarray(np.clip(scaled + 0.5, 0, 255).astype(np.uint8))
+            return np.asarray(np.clip(np.nan_to_num(scaled) + 0.5, 0, 255).astype(np.uint8))
     if image is not None and image.dtype != np.uint8:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    if image is None and _holds_measurements(data):
-        raise PictureError.of(path, "holds 32-bit numbers, not colours; export it with 8 or 16 bits a pixel")
+    if image is None and _mode(data) == "I":
+        raise PictureError.of(path, "holds 32-bit whole numbers, not colours; export it with 8 or 16 bits a pixel")
     if image is None:
         raise PictureError.of(path, "is not a readable picture; leave it out or copy it again")
     return np.asarray(image)
@@ -268,15 +270,25 @@ def _mean(picture: Bytes, factor: int) -> Bytes:
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
 
 
-def _holds_measurements(data: bytes) -> bool:
-    """Whether a picture's values are numbers of 32 bits, as temperatures in degrees are."""
+def _decoded(data: bytes, flags: int) -> NDArray[Any] | None:
+    """A picture as OpenCV decodes it, with its depth, and in the channels that the flags ask for."""
+    import cv2
+
+    if data[:4] not in _TIFF or _mode(data) != "F":
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_ANYDEPTH) if data else None
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)  # else it refuses numbers of 32 bits
+    return image if image is None or flags & cv2.IMREAD_COLOR == 0 else np.repeat(image[..., None], 3, axis=2)
+
+
+def _mode(data: bytes) -> str:
+    """Pillow's name of what pixels are: "F" numbers of 32 bits, as temperatures in degrees are, "I" whole ones."""
     from PIL import Image
 
     try:
         with Image.open(io.BytesIO(data)) as picture:
-            return picture.mode in ("F", "I")
+            return str(picture.mode)
     except (OSError, ValueError, SyntaxError):
-        return False
+        return ""
 
 
 def _is_spread(path: Path) -> bool:
@@ -285,15 +297,14 @@ def _is_spread(path: Path) -> bool:
     return digits is not None and digits[1] == path.parent.name and not is_stored(path)
 
 
-def deep_picture(data: bytes) -> NDArray[np.uint16] | None:
-    """The colours of a picture of 16 bits, uint16 (rows, columns, 3); None for any other file."""
+def deep_picture(data: bytes) -> NDArray[Any] | None:
+    """The values of a picture of 16 or 32 bits, uint16 or float32 (rows, columns, 3); None for any other file."""
     import cv2
 
     if data[:8] == _PNG and data[24:25] != b"\x10":  # its header says so at once
         return None
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
-    return np.asarray(image, np.uint16) if image is not None and image.dtype == np.uint16 else None
+    image = _decoded(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return np.asarray(image) if image is not None and image.dtype in _DEEP else None
 
 
 @lru_cache(maxsize=256)

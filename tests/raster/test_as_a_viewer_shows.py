@@ -56,10 +56,17 @@ def test_pixels_and_sizes_are_those_of_the_file_whatever_its_orientation_tag_say
     assert np.abs(read_rgb(frame.path).astype(float) - COLOURS).mean() < 4.0
 
 
-def test_numbers_of_32_bits_are_no_colours(tmp_path):
-    Image.fromarray(X.astype(np.float32)).save(tmp_path / "thermal.tif")
+def test_numbers_of_32_bits_are_stretched_and_whole_ones_are_no_colours(tmp_path):
+    degrees = 10.0 + X.astype(np.float32) / 4.0
+    degrees[5, 5] = np.nan
+    Image.fromarray(degrees).save(tmp_path / "thermal.tif")
+    gray = read_gray(tmp_path / "thermal.tif")
+    assert gray.shape == degrees.shape and np.ptp(gray) > 250
+    assert np.corrcoef(gray[10:].ravel(), degrees[10:].ravel())[0, 1] > 0.99
+    assert (read_rgb(tmp_path / "thermal.tif") == gray[..., None]).all()
+    Image.fromarray(X.astype(np.int32)).save(tmp_path / "counts.tif")
     with pytest.raises(PictureError, match="8 or 16 bits"):
-        read_gray(tmp_path / "thermal.tif")
+        read_gray(tmp_path / "counts.tif")
 
 
 def test_files_with_odd_names_and_the_first_of_two_pictures_are_mapped_beside_files_that_cannot_be(tmp_path):

@@ -99,6 +99,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="brightness and hue of large areas: as the photos have it (default), or as the basemap has",
     )  # fmt: skip
     add("--blend", choices=("none", "seam"), default="seam", help="blend pictures over a few pixels at seams, or not")
+    add(
+        "--temperature", type=float, nargs="?", const=0.0, metavar="KELVIN",
+        help="also write temperature.tif, of thermal photos in 32-bit TIFF, or in 16 bits with so many kelvin a count",
+    )  # fmt: skip
     add("--covariance", action="store_true", help="add covariances of position and rotation to frames.jsonl")
     add(
         "--tiles", choices=("auto", "yes", "no"), default="auto",
@@ -267,6 +271,10 @@ def _check(args: argparse.Namespace) -> None:
         raise InputError(f"--unreferenced goes without {', '.join(f'--{name}' for name in _PLACING)} and --until")
     if args.unreferenced and is_stored(args.out):
         raise InputError("--unreferenced writes into a folder of this machine; name one for --out")
+    if args.temperature is not None and (
+        args.until != "fine" or args.unreferenced or not 0.0 <= args.temperature <= 1.0
+    ):
+        raise InputError("--temperature takes kelvin a count (0.04), and goes without --until and --unreferenced")
     if args.tone == "map":
         if args.basemap is None:
             raise InputError("--tone map takes brightness and hue from a basemap; give one with --basemap")

@@ -30,6 +30,7 @@ _PURPOSES: Final = {
     "footprints.gpkg": "For QGIS: footprints of the pictures (GeoPackage)",
     "seamlines.gpkg": "For QGIS: which picture shows which ground (GeoPackage)",
     "confidence.tif": "For QGIS: how far each place can be trusted (GeoTIFF)",
+    "temperature.tif": "For QGIS: temperature of the ground, degrees Celsius (GeoTIFF)",
     "change.tif": "For QGIS: where the ground changed (GeoTIFF)",
     "change.gpkg": "For QGIS: changed ground with area, kind and photos (GeoPackage)",
     SURFACE: "For QGIS: heights of the surface (GeoTIFF)",
@@ -111,7 +112,7 @@ def _copy(cog: Path, folder: Path) -> None:
     if surface is not None:
         shutil.copyfile(surface, folder / SURFACE)
     products = ("footprints.gpkg", "seamlines.gpkg", "confidence.tif", "report.html", "report.json", "frames.jsonl")
-    for name in (*products, "log.csv", "change.tif", "change.gpkg"):
+    for name in (*products, "temperature.tif", "log.csv", "change.tif", "change.gpkg"):
         if (cog.parent / name).is_file():
             shutil.copyfile(cog.parent / name, folder / name)
 
