@@ -222,10 +222,13 @@ def read_checkpoints(table: Path, pixel_scale: float = 1.0) -> list[Checkpoint]:
     if not lines:
         raise InputError(f"{table.name} holds no points")
     separator = max(";,", key=lines[0].count)
-    if separator not in lines[0]:
-        points = _gcp_list(lines, table.name, pixel_scale)
-    else:
-        points = _csv(lines, table.name, pixel_scale, separator)
+    try:
+        if separator not in lines[0]:
+            points = _gcp_list(lines, table.name, pixel_scale)
+        else:
+            points = _csv(lines, table.name, pixel_scale, separator)
+    except csv.Error as error:
+        raise InputError(f"{table.name} is no table ({error}); export it again") from None
     if not points:
         raise InputError(f"{table.name} holds no points below its first line")
     return points

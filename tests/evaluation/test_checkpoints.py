@@ -118,6 +118,7 @@ def test_points_measured_on_the_orthoimage_with_the_surveys_own_error(tmp_path):
         ("name,lat_deg,lon_deg,image\na,48,11,x.jpg\n", "column 'column' is missing"),
         ("name,lat_deg,lon_deg,image,column,row\na,nan,11,x.jpg,1,1\n", "not a number"),
         ("name,lat_deg,lon_deg,image,column,row\na,48,11,elsewhere.jpg,1,1\n", "check the names of the images"),
+        ("name,lat_deg,lon_deg\n" + "x" * 200_000 + ",47.0,8.0\n", "is no table"),
     ],
 )
 def test_a_bad_table_is_one_sentence(tmp_path, text, said):
