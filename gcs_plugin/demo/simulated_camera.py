@@ -266,9 +266,11 @@ class VideoServer(VideoStream):
             if data is None:
                 break
             while connection is None or not _sent(connection, data):
-                connection = None
-                self._listener.settimeout(30.0)
+                if connection is not None:  # its reader has gone
+                    connection.close()
+                    connection = None
                 try:
+                    self._listener.settimeout(30.0)
                     connection = self._newest()
                 except TimeoutError:
                     if not self._live:  # nobody watches any more
