@@ -13,11 +13,12 @@ from typing import Any, Final, TypedDict
 import numpy as np
 
 from gcs_plugin.daemon.exports import Exports, SightingRow
+from gcs_plugin.daemon.store.console_state import number_in
 from gcs_plugin.daemon.store.daemon_events import Events
-from gcs_plugin.daemon.store.frame_rows import all_frames
+from gcs_plugin.daemon.store.frame_rows import FrameRow, all_frames
 from gcs_plugin.daemon.store.journal import Journal
 from orthoswarm.control.control_observations import pixel_ray
-from orthoswarm.evaluation.checkpoints import RECEIVERS_LOCAL_SIGMA_M, Mark, read_checkpoints
+from orthoswarm.evaluation.checkpoints import RECEIVERS_LOCAL_SIGMA_M, SAME_PLACE_M, Mark, read_checkpoints
 from orthoswarm.evaluation.misread_points import away_m
 from orthoswarm.evaluation.point_rays import intersect_rays, intersection
 from orthoswarm.model.errors import InputError
@@ -25,7 +26,7 @@ from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame
 
 _MOST_POINTS: Final = 1000
-_SAME_PLACE_M: Final = 0.02  # a table that is read again keeps the marks of points that are the same
+_MOST_PX: Final = 1e6  # of a side of a picture
 
 
 class MarkRow(TypedDict):
@@ -65,11 +66,14 @@ class SurveyPoints:
 
     def rows(self) -> list[PointRow]:
         """The points in the order of their table."""
-        points = self._points()
-        seqs = {int(seq) for point in points for seq in point["marks"]}
-        names = {row.seq: (row.vehicle, row.image) for row in all_frames(self._journal) if row.seq in seqs}
-        found = [_row(point, names) for point in points]
-        if seqs:
+        found = [
+            PointRow(
+                name=point["name"], lat_deg=point["lat_deg"], lon_deg=point["lon_deg"],
+                marks=[*point["marks"].values()], off_m=None, rays_miss_m=None, findings=[],
+            )
+            for point in self._points()
+        ]  # fmt: skip
+        if any(row["marks"] for row in found):
             frames, level, grid = self._exports.placed()
             placed = {(p.frame.vehicle, p.frame.image): p for p in frames}
             for row in found:
@@ -82,7 +86,7 @@ class SurveyPoints:
         Marks of points that are in both stay; those of the table are taken where a picture has that name.
 
         Raises:
-            InputError: it cannot be read, or holds too many.
+            InputError: it cannot be read, holds too many, or marks a point outside its picture.
         """
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "the table"
@@ -90,15 +94,15 @@ class SurveyPoints:
             read = read_checkpoints(path)
         if len(read) > _MOST_POINTS:
             raise InputError(f"the table holds {len(read)} points; send at most {_MOST_POINTS}")
-        seqs = {row.image: row.seq for row in all_frames(self._journal)} if any(p.marks for p in read) else {}
+        frames = {row.image: row for row in all_frames(self._journal)} if any(p.marks for p in read) else {}
         with self._lock:
             known = {point["name"]: point for point in self._points()}
             points = []
             for point in read:
-                marks = {str(seqs[m.image]): [m.column, m.row] for m in point.marks if m.image in seqs}
+                marks = dict(_stored(frames[m.image], m) for m in point.marks if m.image in frames)
                 lon, lat = (float(v) for v in point.surveyed)
                 old = known.get(point.name, {"lon_deg": np.inf, "lat_deg": np.inf, "marks": {}})
-                if away_m(np.array([old["lon_deg"], old["lat_deg"]]), point.surveyed) < _SAME_PLACE_M:
+                if away_m(np.array([old["lon_deg"], old["lat_deg"]]), point.surveyed) < SAME_PLACE_M:  # read again
                     marks = old["marks"] | marks
                 points.append({"name": point.name, "lat_deg": lat, "lon_deg": lon, "marks": marks})
             self._journal.remember("points", points)
@@ -111,8 +115,7 @@ class SurveyPoints:
         Raises:
             InputError: there is no such point or picture, or the mark lies outside it.
         """
-        seq = body.get("seq")
-        at: tuple[Any, Any] = (body.get("column"), body.get("row"))
+        seq, away = body.get("seq"), body.get("column") is None and body.get("row") is None
         frame = next((row for row in all_frames(self._journal) if row.seq == seq), None)
         if frame is None:
             raise InputError(f"there is no picture {seq}; see /api/frames")
@@ -121,13 +124,11 @@ class SurveyPoints:
             point = next((point for point in points if point["name"] == body.get("name")), None)
             if point is None:
                 raise InputError(f"there is no point {body.get('name')}; see /api/points")
-            if at == (None, None):
+            if away:
                 point["marks"].pop(str(seq), None)
-            elif all(isinstance(v, int | float) and not isinstance(v, bool) and np.isfinite(v) for v in at):
-                Mark(frame.image, *at).check_inside(*frame.size)
-                point["marks"][str(seq)] = [float(v) for v in at]
             else:
-                raise InputError("column and row are not pixels; send numbers, or null to take the mark away")
+                column, line = (number_in(body, key, _MOST_PX) for key in ("column", "row"))
+                point["marks"] |= [_stored(frame, Mark(frame.image, column, line))]
             self._journal.remember("points", points)
         self._events.tell("points")
         return self.rows()
@@ -160,17 +161,13 @@ class SurveyPoints:
         return found
 
 
-def _row(point: Mapping[str, Any], names: Mapping[int, tuple[str, str]]) -> PointRow:
-    """A point as it is stored; names: vehicle and image of pictures by seq."""
-    marks = [
-        MarkRow(seq=int(seq), vehicle=names[int(seq)][0], image=names[int(seq)][1], column=u, row=v, off_px=None)
-        for seq, (u, v) in point["marks"].items()
-        if int(seq) in names
-    ]
-    return PointRow(
-        name=point["name"], lat_deg=point["lat_deg"], lon_deg=point["lon_deg"], marks=marks, off_m=None,
-        rays_miss_m=None, findings=[],
-    )  # fmt: skip
+def _stored(frame: FrameRow, mark: Mark) -> tuple[str, MarkRow]:
+    """A mark as the journal has it, by the picture's number. Raises InputError: it lies outside the picture."""
+    mark.check_inside(*frame.size)
+    row = MarkRow(
+        seq=frame.seq, vehicle=frame.vehicle, image=frame.image, column=mark.column, row=mark.row, off_px=None
+    )
+    return str(frame.seq), row
 
 
 def _measure(row: PointRow, placed: Mapping[tuple[str, str], PlacedFrame], level: float, grid: LocalGrid) -> None:

@@ -57,7 +57,6 @@ from orthoswarm.trajectory.legs import split_legs
 
 _SPOT_DEG: Final = 0.001  # records farther apart than 110 m are none of a vehicle that hovers
 _QUICK_LOOK: Final = "a quick look at a quarter of the detail; the same command without --quick goes on from it"
-_UNKNOWN: Final = "nothing tells where it is"
 _MARKS: Final = "two control points, some way apart, must be seen in them"
 _APART: Final = "none with the largest part, of which the picture is made"
 _NOT_FOUND: Final = "they were not found on the basemap within the radius of --near"
@@ -402,7 +401,7 @@ def with_found_positions(run: RunContext, ingest: Ingest) -> Ingest:
     if options.unreferenced:
         said = _left_out(len(photos) - len(placed), left, _APART)
     elif points or searched is not None:
-        why = f"{_UNKNOWN}: {_MARKS if searched is None else _NOT_FOUND}"
+        why = f"nothing tells where it is: {_MARKS if searched is None else _NOT_FOUND}"
         said += _left_out(len(photos) - len(placed), left, why)
     return replace(
         ingest,

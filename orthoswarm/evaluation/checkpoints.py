@@ -30,7 +30,7 @@ from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
 
 STANDARD_COUNT = 30  # checkpoints that a statement by the standard needs at least
-_SAME_PLACE_M = 0.02  # lines of one point may round its coordinates differently
+SAME_PLACE_M = 0.02  # lines of one point may round its coordinates differently
 _DECIMAL_COMMA = re.compile(r"^([-+]?\d+),(\d+)$")
 
 SURVEY_SIGMA_M: Final = 0.05
@@ -296,7 +296,7 @@ def _merged(lines: Iterable[Checkpoint]) -> list[Checkpoint]:
     for line in lines:
         same_name = places.setdefault(line.name, [])
         known = next(
-            (p for p in same_name if p.written == line.written or away_m(p.surveyed, line.surveyed) <= _SAME_PLACE_M),
+            (p for p in same_name if p.written == line.written or away_m(p.surveyed, line.surveyed) <= SAME_PLACE_M),
             None,
         )
         if known is None:

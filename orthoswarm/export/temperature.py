@@ -26,7 +26,7 @@ from orthoswarm.mosaic.extent import drawn_window
 from orthoswarm.mosaic.kernels.drawn_heights import heights
 from orthoswarm.mosaic.kernels.pixel_sampling import UNIT, place
 from orthoswarm.mosaic.kernels.render_arrays import Shots, crop
-from orthoswarm.stores.local_copies import content
+from orthoswarm.raster.picture_file import read_values
 
 TEMPERATURE: Final = "temperature.tif"
 _ZERO_K: Final = 273.15
@@ -41,13 +41,12 @@ def read_temperatures(path: Path, kelvin: float) -> Floats:
     kelvin: a count of a picture of 16 bits; 0 where they have 32.
 
     Raises:
-        InputError: its pixels are no temperatures, or it cannot be read.
+        InputError: its pixels are no temperatures. PictureError: it cannot be read.
     """
-    flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(np.frombuffer(content(path), np.uint8), flags)
-    if image is not None and image.ndim == 2 and image.dtype in (np.float32, np.float64):
+    image = read_values(path)
+    if image is not None and image.ndim == 2 and image.dtype == np.float32:
         celsius = not np.nanmedian(image) > _KELVIN_FROM
-        return np.asarray(image, np.float32) - np.float32(0.0 if celsius else _ZERO_K)
+        return np.asarray(image - np.float32(0.0 if celsius else _ZERO_K))
     if image is not None and image.ndim == 2 and image.dtype == np.uint16:
         if kelvin <= 0.0:
             raise InputError(f"{path.name} has counts of 16 bits: say how many kelvin one is, --temperature 0.04")
@@ -68,7 +67,7 @@ def write_temperature(
         kelvin: see `read_temperatures`. scratch: folder for a file of the map's size.
 
     Raises:
-        InputError: a picture cannot be read any more. StorageError: if the disk is full.
+        PictureError: a picture cannot be read any more. StorageError: if the disk is full.
     """
     drawn = _Drawn(canvas, frames, terrain, kelvin)
     row0, row1, col0, col1 = drawn_window(canvas)

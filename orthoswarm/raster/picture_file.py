@@ -117,6 +117,17 @@ def read_rgba(path: Path) -> Bytes:
     return np.asarray(cv2.cvtColor(_decode_other(path, data, gray=False), cv2.COLOR_BGR2RGBA))
 
 
+def read_values(path: Path) -> NDArray[Any] | None:
+    """A picture's values as they are stored, (rows, columns) or (rows, columns, channels); None if they cannot be read.
+
+    Raises:
+        PictureError: if the file cannot be read, or is not a picture.
+    """
+    import cv2
+
+    return cv2.imdecode(np.frombuffer(_bytes(path), np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+
+
 def _is_jpeg(data: bytes) -> bool:
     return data[:2] == b"\xff\xd8"
 

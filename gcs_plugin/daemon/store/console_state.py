@@ -136,8 +136,8 @@ def _find(body: Mapping[str, Any]) -> FindRow:
     if not isinstance(note, str) or len(note) > _MOST_NOTE:
         raise InputError(f"note is not a text of at most {_MOST_NOTE} characters; send a shorter one")
     return {
-        "lat_deg": _number(body, "lat_deg", 90.0), "lon_deg": _number(body, "lon_deg", 180.0),
-        "sigma_m": None if body.get("sigma_m") is None else _number(body, "sigma_m", 1e6), "note": note,
+        "lat_deg": number_in(body, "lat_deg", 90.0), "lon_deg": number_in(body, "lon_deg", 180.0),
+        "sigma_m": None if body.get("sigma_m") is None else number_in(body, "sigma_m", 1e6), "note": note,
     }  # fmt: skip
 
 
@@ -153,7 +153,8 @@ def _time_of(body: Mapping[str, Any]) -> str | None:
         raise InputError("time is not a time in ISO 8601; send for example 2026-05-28T20:26:40Z, or none") from None
 
 
-def _number(body: Mapping[str, Any], key: str, largest: float) -> float:
+def number_in(body: Mapping[str, Any], key: str, largest: float) -> float:
+    """A number of a request, of either sign. Raises InputError: it is missing, no number, or larger."""
     value = body.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= largest:
         raise InputError(f"{key} is missing or out of range; send a number, at most {largest:g}")

@@ -81,10 +81,14 @@ def test_what_makes_no_sense_is_refused(served, shots):
     seq = served.get("/api/frames").json()[0]["seq"]
     for body in (
         {"seq": 999, "column": 1, "row": 1}, {"seq": seq, "column": 1e6, "row": 1},
-        {"seq": seq, "column": "a", "row": 1}, {"seq": seq, "column": None, "row": 1},
+        {"seq": seq, "column": "a", "row": 1}, {"seq": seq, "column": 10**400, "row": 1},
+        {"seq": seq, "column": None, "row": 1},
         {"seq": seq, "column": True, "row": 1}, {"column": 1, "row": 1},
         {"name": "nobody", "seq": seq, "column": 1, "row": 1},
     ):  # fmt: skip
         assert mark(served, **body).status_code == 422, body
+    image = served.get("/api/frames").json()[0]["image"]
+    outside = put(served, f"EPSG:4326\n8.0 47.0 NaN 5000 5000 {image} {NAME}\n")
+    assert outside.status_code == 422 and "a point is marked at 5000, 5000" in outside.text
     assert served.get("/api/points/pictures?name=nobody").status_code == 422
     assert served.get("/api/points").json()[0]["marks"] == []
