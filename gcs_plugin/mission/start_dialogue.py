@@ -3,8 +3,9 @@
 What a station remembers of a vehicle is not what it is now: another station, a remote control, a failsafe or the
 vehicle itself may have changed its mode, its mission or its place while a check ran or a takeoff waited. So in the
 second before each command to arm its mode, arming, place and mission are read from it, and its mode and arming again
-before MISSION_START. The modes are what was measured to work with both autopilots: one that can be armed (ArduPilot
-stays in AUTO after a mission and refuses to arm there), arm, MAV_CMD_MISSION_START.
+before MISSION_START. A vehicle that obeys another station, or stores its mission, meanwhile is not started. The modes
+are what was measured to work with both autopilots: one that can be armed (ArduPilot stays in AUTO after a mission and
+refuses to arm there), arm, MAV_CMD_MISSION_START.
 """
 
 import math
@@ -15,7 +16,7 @@ from gcs_plugin.config import COMMAND
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect, has_place, is_autopilot
 from gcs_plugin.mission.command_dialogues import Command, InOrder, Pilot, Several
 from gcs_plugin.mission.download import AT_ONCE, MissionDownload
-from gcs_plugin.mission.exchange import Address, Exchange, Outcome, Verdict, command_long
+from gcs_plugin.mission.exchange import MISSION, Address, Exchange, Outcome, Verdict, command_long
 from gcs_plugin.mission.flight_modes import Modes, mode_params
 from gcs_plugin.mission.items import Mission, difference
 from gcs_plugin.mission.mission_builder import unflyable
@@ -44,6 +45,15 @@ def others_command(message: Message, own: Address) -> bool:
     """True if a COMMAND_ACK shows that a vehicle obeys another station."""
     obeyed = message.result in (dialect.MAV_RESULT_ACCEPTED, dialect.MAV_RESULT_IN_PROGRESS)
     return bool(message.command in _MOVES and obeyed and message.target_system not in (0, own.system))
+
+
+def _others_doing(message: Message, own: Address) -> str:
+    """What a vehicle's answer to another station shows, in words; empty if nothing that a start must know."""
+    kind = message.get_type()
+    if kind == "COMMAND_ACK" and others_command(message, own):
+        return "has been commanded by another station"
+    stores = kind in ("MISSION_REQUEST", "MISSION_REQUEST_INT") and message.mission_type == MISSION
+    return "is given a mission by another station" if stores and message.target_system != own.system else ""
 
 
 def mission_id(message: Message) -> int:
@@ -145,8 +155,8 @@ class LastLook(Exchange):
             if away > MOVED_M:
                 self._stays(f"was moved by {away:.0f} m since its start was given")
             self._fix = now
-        elif kind == "COMMAND_ACK" and others_command(message, self.own):
-            self._stays("has been commanded by another station since its start was given")
+        elif what := _others_doing(message, self.own):
+            self._stays(f"{what} since its start was given")
         messages: list[Message] = []
         if kind == "MISSION_CURRENT" and self.expected is not None and self.expected.known_id and not self._reading:
             if mission_id(message) == self.expected.known_id and self.expected.mission is not None:
@@ -267,9 +277,8 @@ class Guarded(Exchange):
             if asked and watch.expected is not None and watch.expected.known_id:  # another mission, by its checksum
                 self._again_s = None
                 return self._follow(self._next(replace(self.look, was=None), now), now)
-        elif message.get_type() == "COMMAND_ACK" and others_command(message, self.own):
-            text = "has been commanded by another station meanwhile, so it was not started"
-            self._end(False, f"vehicle {self.vehicle.system} {text}")
+        elif what := _others_doing(message, self.own):
+            self._end(False, f"vehicle {self.vehicle.system} {what} meanwhile, so it was not started")
             return []
         return self._follow(self._step.feed(message, now), now) if self._again_s is None else []
 

@@ -28,6 +28,7 @@ class Heard:
     places: list = field(default_factory=list)  # (time, latitude, longitude)
     checksum: tuple = (-math.inf, 0)
     obeys_other: list = field(default_factory=list)  # (time, command)
+    stores_other: float = -math.inf  # when it last asked another station for an item
     ordered: list = field(default_factory=list)  # by us: (time, parameters of a mode)
     count: int = 0
     items: dict = field(default_factory=dict)  # seq -> item
@@ -97,6 +98,8 @@ class Rules:
             heard.checksum = now, int.from_bytes(bytes(message.get_payload() or b"")[6:10], "little")
         elif kind == "COMMAND_ACK" and message.target_system == OTHER.system and message.result == 0:
             heard.obeys_other.append((now, int(message.command)))
+        elif kind == "MISSION_REQUEST_INT" and message.target_system == OTHER.system:
+            heard.stores_other = now
         elif kind == "MISSION_COUNT" and message.target_system == GROUND_STATION.system and message.mission_type == 0:
             heard.count = int(message.count)
         elif kind in ("MISSION_ITEM_INT", "MISSION_ITEM") and message.target_system == GROUND_STATION.system:
@@ -136,6 +139,10 @@ class Rules:
         self._last[vehicle.system] = given
         if command == ARM:
             self._fresh(vehicle, given, what)
+        elif given.mission is not None and self.heard[vehicle.system].stores_other > given.at:
+            held = vehicle.held_since(self.field.now - 2 * self.field.delay_s)
+            if all(difference(given.mission, list(items)) for items in held):
+                self._breaks(1, f"{what}, it was heard to be given another mission")
         self._not_stopped(vehicle, given, what)
         self._others_climbed(vehicle, given, what)
 
