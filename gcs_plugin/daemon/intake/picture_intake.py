@@ -6,7 +6,7 @@ Those that were refused, dropped or left off the map are counted by cause; recen
 import logging
 import threading
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,7 +21,9 @@ from gcs_plugin.daemon.store.sortie_rows import present_sortie
 from gcs_plugin.links.tlog_writer import write_link_log
 from orthoswarm.export.product_files import iso_time
 from orthoswarm.model.errors import OrthoSwarmError, StorageError
+from orthoswarm.model.frame import UNSTATED_SIGMA_M
 from telemetry.live.live_poses import LinkPoses
+from telemetry.samples.held_fixes import FixNews
 
 CAUSES: Final = {
     "disk": "the workspace's disk is full or gone",
@@ -113,6 +115,7 @@ class PictureIntake:
     ) -> None:
         self._journal, self._store, self._events = journal, store, events
         self._poses, self._refused = poses, refused
+        self._news: defaultdict[str, FixNews] = defaultdict(FixNews)
         self.accepted: Counter[str] = Counter()
 
     def add(self, pose: PostedPose, data: bytes) -> tuple[int, bool]:
@@ -133,9 +136,9 @@ class PictureIntake:
                 self._refused.note_name_taken(pose.vehicle, pose.image)
             return known[0], False
         width, height, suffix = picture_size(data)
-        pose = self._with_fix(pose)
-        self._store.require_space(len(data))
         time_s = came if pose.time_s is None else pose.time_s
+        pose = self._with_fix(self._aged(pose, time_s))
+        self._store.require_space(len(data))
         path, size = self._store.put(key, suffix, data), (width, height)
         values = pose.values | ({"origin": pose.origin} if pose.origin else {})
         change = add_frame(key, pose.vehicle, pose.image, time_s=time_s, path=path, size=size, pose=values)
@@ -151,12 +154,19 @@ class PictureIntake:
             ))  # fmt: skip
         return seq, new
 
+    def _aged(self, pose: PostedPose, time_s: float) -> PostedPose:
+        """The pose, with how far the vehicle may have flown since its receiver had news."""
+        if not pose.has_fix:
+            return pose
+        held_m = self._news[pose.vehicle].hear(time_s, (pose.values["lat_deg"], pose.values["lon_deg"]), None)
+        return replace(pose, values=pose.values | {"held_m": held_m}) if held_m > UNSTATED_SIGMA_M else pose
+
     def _with_fix(self, pose: PostedPose) -> PostedPose:
         """The pose; if its receiver had no fix, with the values of the vehicle's link at that time."""
         linked = None if pose.has_fix else linked_pose(self._poses, pose.vehicle, pose.image, pose.time_s)
         if linked is None:
             return pose
-        without = {k: v for k, v in pose.values.items() if k not in ("lat_deg", "lon_deg", "gps_fix")}
+        without = {k: v for k, v in pose.values.items() if k not in ("lat_deg", "lon_deg", "gps_fix", "held_m")}
         return replace(linked, values=linked.values | without, origin=linked.origin | pose.origin)
 
 

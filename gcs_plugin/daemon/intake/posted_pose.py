@@ -15,6 +15,7 @@ from orthoswarm.model.earth import distance_m
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Frame
 from telemetry.live.live_poses import LinkPoses
+from telemetry.samples.held_fixes import LOST_SIGMA_M, stated_sigma_m
 from telemetry.samples.sample import Sample, sample_of
 from telemetry.samples.sample import frame_of as frame_of_sample
 
@@ -40,7 +41,8 @@ class PostedPose:
     Attributes:
         vehicle: id; image: name, as posted. time_s: UTC epoch seconds, None if not given.
         values: lat_deg, lon_deg and further known values, in degrees and metres; `gps_fix`: MAVLink's GPS_FIX_TYPE;
-            `damaged`: True for a picture that lost parts.
+            `damaged`: True for a picture that lost parts; `held_m`: how far the vehicle may have flown since its
+            receiver had news, where that is more than a receiver's noise.
         origin: sources of position, height, angles and time, as far as known.
     """
 
@@ -57,7 +59,9 @@ class PostedPose:
 
 
 def is_position(values: Mapping[str, Any]) -> bool:
-    """Whether a pose has a valid position: a receiver without a fix sends 0, 0 or a GPS_FIX_TYPE below 2D."""
+    """Whether a pose has a valid position: without a fix a receiver sends 0, 0, an old fix, or one below 2D."""
+    if values.get("held_m", 0.0) > LOST_SIGMA_M:
+        return False
     lat, lon = float(values["lat_deg"]), float(values["lon_deg"])
     return values.get("gps_fix", _FIX_2D) >= _FIX_2D and not (abs(lat) < _NOWHERE_DEG and abs(lon) < _NOWHERE_DEG)
 
@@ -115,6 +119,8 @@ def frame_of(values: Mapping[str, Any], *, image: str, path: Path, vehicle: str,
     """The frame of a stored picture with the pose values from `parse_pose`, and their `origin` if known."""
     sample = Sample(time_s=time_s, **{field: values[key] for key, field in _FIELDS.items() if key in values})
     sample.height_is_ground = bool(values.get("height_is_ground"))
+    if "held_m" in values:
+        sample.sigma_m = stated_sigma_m(sample.sigma_m, values["held_m"])
     if not is_position(values):
         sample.lat_deg = sample.lon_deg = 0.0  # kept without a place, until the vehicle's link says where it was
     frame = frame_of_sample(sample, image=image, path=path, vehicle=vehicle, width=size[0], height=size[1])

@@ -9,6 +9,7 @@ import shutil
 import threading
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -247,7 +248,8 @@ def frames_of(journal: Journal, store: PictureStore, job: Job) -> tuple[list[Fra
     if not rows:
         raise OrthoSwarmError(f"{job.vehicle} has no pictures that could be drawn; check its camera and its poses")
     small = {row.image: thumbnail_of(row.thumbnail) for row in rows if row.thumbnail is not None}
-    return measured_frames([frame_of_row(row, store) for row in rows]), small
+    told = [replace(row, pose={k: v for k, v in row.pose.items() if k != "held_m"}) for row in rows]
+    return measured_frames([frame_of_row(row, store) for row in told]), small  # by fixes that came later, too
 
 
 def detail_of(solved: SortieResult, legs: Iterable[LegRow]) -> SortieDetail:

@@ -126,7 +126,7 @@ class MapSite:
     def place(self, frame: Frame, drawn: int) -> tuple[Camera, float] | str:
         """The frame's camera and sigma in metres, after making room for it on the layer; or why it cannot be drawn."""
         if not is_position({"lat_deg": frame.fix.lat_deg, "lon_deg": frame.fix.lon_deg}):
-            return "its receiver had no fix (the position is 0, 0); nothing tells where it was taken"
+            return "its receiver had no fix, or has told the same place for too long; nothing tells where it was taken"
         far = self._is_far(frame)
         if far is not None:
             return far

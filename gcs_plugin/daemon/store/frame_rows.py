@@ -121,10 +121,14 @@ def newest_frames(journal: Journal) -> dict[int, FrameRow]:
 
 
 def sortie_frames(journal: Journal, vehicle: str, sortie: int | None) -> list[FrameRow]:
-    """A sortie's pictures in order of time, without rejected ones, with thumbnails of the drawn ones."""
+    """A sortie's pictures in order of time, with thumbnails of the drawn ones.
+
+    Rejected ones are left out, but for those of a receiver that had no news: later fixes may tell their places.
+    """
     rows = journal.rows(
         "SELECT frames.*, thumbnails.rgb FROM frames LEFT JOIN thumbnails USING (seq)"
-        " WHERE vehicle = ? AND sortie = ? AND reason IS NULL ORDER BY time, seq",
+        " WHERE vehicle = ? AND sortie = ? AND (reason IS NULL OR json_extract(pose, '$.held_m') > 0)"
+        " ORDER BY time, seq",
         (packed(vehicle), sortie),
     )
     return [_frame(row, thumbnail=row["rgb"]) for row in rows]

@@ -242,7 +242,7 @@ def sortie_refined(placed: PlacedSortie, stages: Mapping[str, tuple[str, float]]
     rejected = [(why, *key, packed(image)) for image, why in lost.items()]
     where = "WHERE vehicle = ? AND sortie = ? AND image = ?"
     return all_changes(
-        statements(f"UPDATE frames SET stage = ?, sigma = ? {where}", rows),
+        statements(f"UPDATE frames SET stage = ?, sigma = ?, reason = NULL {where}", rows),
         statements(f"UPDATE frames SET stage = 'rejected', reason = ? {where}", rejected),
         _stands("solutions", placed),
     )

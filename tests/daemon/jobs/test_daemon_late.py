@@ -46,6 +46,39 @@ def stages(daemon):
 
 
 @pytest.mark.slow
+def test_a_receiver_without_news_draws_nothing_and_the_refinement_finds_where_it_flew(daemon, flight):
+    frames = flight[0][:20]
+    here = frames[9].fix  # the receiver tells this place until the seventeenth picture
+    held = [replace(f, fix=replace(f.fix, lat_deg=here.lat_deg, lon_deg=here.lon_deg)) for f in frames[10:17]]
+    post_at_once(daemon, [*frames[:10], *held, *frames[17:]])
+    end = time.monotonic() + LIMIT_S
+    while len(rows := daemon.views.frames()) < 20 or any(r["stage"] == "realtime" and not r["on_map"] for r in rows):
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    left = {r["image"]: r for r in rows if not r["on_map"]}
+    assert left.keys() == {f.image for f in held if _flown_m(frames, f) > 20.0}
+    assert len(left) >= 3
+    assert all("told the same place for too long" in row["reason"] for row in left.values())
+    assert all(r["sigma_m"] > 4.0 for r in rows if r["image"] in {f.image for f in held} - left.keys())
+    complete(daemon)
+    (refined,) = after_job(daemon, 1)
+    assert refined.state == "done", refined.message
+    rows = {r["image"]: r for r in daemon.views.frames()}
+    assert {r["stage"] for r in rows.values()} == {"fine"}
+    assert all(r["on_map"] and r["reason"] is None for r in rows.values())
+    path = daemon.journal.one("SELECT path FROM solutions")["path"]
+    for placed in read_solution(daemon.settings.workspace / "solutions" / path).solution.placed:
+        own = next(f for f in frames if f.image == placed.frame.image)
+        assert np.hypot(*(placed.camera.to_ground([119.5, 89.5]) - truth(own))) < 0.5
+
+
+def _flown_m(frames, frame):
+    """How far the vehicle flew since the tenth picture, by its speed before."""
+    speed = np.hypot(*(truth(frames[9]) - truth(frames[8]))) / (frames[9].time_s - frames[8].time_s)
+    return speed * (frame.time_s - frames[9].time_s)
+
+
+@pytest.mark.slow
 def test_a_few_late_pictures_are_laid_beside_the_others_and_many_refined_with_them(daemon, flight):
     frames, _ = flight
     late = [frames[k] for k in (5, 15, 16)]
