@@ -33,8 +33,9 @@ _WITH_POSITION = {*range(16, 20), 21, 22, 31, 82, 84, 85, 94}
 _FIRMWARE: dict[Autopilot, int] = {"ardupilot": 3, "px4": 12}
 _MULTIROTOR = 2  # MAV_TYPE
 _WINGED = frozenset({1, *range(19, 26)})  # MAV_TYPE: fixed wings, VTOLs
-_ABOVE_SEA, _ABOVE_GROUND = 2, (3, 4)  # QGroundControl's AltMode
+_ABOVE_TAKEOFF, _ABOVE_SEA, _ABOVE_GROUND = 1, 2, (3, 4)  # QGroundControl's AltMode
 _LENS = ("SensorWidth", "FocalLength", "ImageWidth", "ImageHeight")
+_FLOWN_ANEW = ("survey", "CorridorScan")  # QGroundControl's patterns that lines are laid over or along
 _NOT_PLANNED = {
     "HoverAndCapture": "that it stops for each picture",
     "CameraTriggerInTurnAround": "pictures in turns",
@@ -370,8 +371,13 @@ def _parse_plan(document: Mapping[str, Any]) -> MissionFile:
     surveys: list[tuple[LatLon, ...]] = []
     settings: list[SurveySettings] = []
     polylines: list[tuple[LatLon, ...]] = []
+    others = list[str]()
     for entry in mission["items"]:
         if entry.get("type") == "ComplexItem":
+            kind = str(entry.get("complexItemType", "survey"))[:_MOST_NAME]
+            if kind not in _FLOWN_ANEW:
+                others.append(f"its {kind}")
+                continue
             if "polygon" in entry:
                 surveys.append(_ring(entry["polygon"]))
                 settings.append(_survey_settings(entry))
@@ -395,6 +401,7 @@ def _parse_plan(document: Mapping[str, Any]) -> MissionFile:
     home = mission.get("plannedHomePosition")
     speed = mission.get("hoverSpeed") or mission.get("cruiseSpeed")
     survey = settings[0] if settings else SurveySettings()
+    survey = replace(survey, left=(*survey.left, *others))
     if any(other.values != survey.values for other in settings):
         survey = replace(survey, left=(*survey.left, "other settings of further surveys"))
     if survey.values and speed:
@@ -418,7 +425,8 @@ def _survey_settings(entry: Mapping[str, Any]) -> SurveySettings:
     style = entry.get("TransectStyleComplexItem") or {}
     camera = style.get("CameraCalc") or {}
     found, left = list[SurveyValue](), list[str]()
-    height_m, mode = _amount(camera, "DistanceToSurface"), camera.get("DistanceMode", 1)
+    older = _ABOVE_SEA if camera.get("DistanceToSurfaceRelative") is False else _ABOVE_TAKEOFF  # before DistanceMode
+    height_m, mode = _amount(camera, "DistanceToSurface"), camera.get("DistanceMode", older)
     if height_m and mode == _ABOVE_SEA:
         left.append(f"the height of {height_m:g} m above the sea")
     elif height_m:
@@ -427,6 +435,8 @@ def _survey_settings(entry: Mapping[str, Any]) -> SurveySettings:
     lens = _lens_values(camera)
     found += lens
     left += ["the distances of its lines and pictures, as it names no lens"] if camera and not lens else []
+    if every_s := _amount(camera, "MinTriggerInterval"):
+        found.append(SurveyValue("quickest_s", every_s, f"at most one picture in {every_s:g} s"))
     angle, turn_m = entry.get("angle"), _amount(style, "TurnAroundDistance")
     if camera and isinstance(angle, int | float) and math.isfinite(angle):
         found.append(SurveyValue("heading", angle % 180.0, f"lines at {angle % 180.0:g} degrees"))

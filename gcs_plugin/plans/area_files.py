@@ -193,6 +193,7 @@ def _shapes(source: str, name: str, any_size: bool) -> Shapes:
     from pyogrio.errors import DataLayerError, DataSourceError, FeatureError, FieldError, GeometryError
 
     polygons, lines, circles, unused = list[Polygon](), list[Ring](), list[Circle](), Counter[str]()
+    doubts = set[str]()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # of OGR, about what it reads all the same
@@ -206,25 +207,26 @@ def _shapes(source: str, name: str, any_size: bool) -> Shapes:
         if part.is_empty:
             unused["feature without a shape"] += 1
         elif part.geom_type == "Polygon":
-            shell, *holes = [_degrees(r.coords, crs, name) for r in (part.exterior, *part.interiors)]
+            shell, *holes = [_degrees(r.coords, crs, name, doubts) for r in (part.exterior, *part.interiors)]
             polygons.append(Polygon(shell, tuple(holes)))
         elif part.geom_type == "LineString":
-            line = _degrees(part.coords, crs, name, 2)
+            line = _degrees(part.coords, crs, name, doubts, 2)
             strip = shape_files.strip_of(line, said, name)
             polygons += strip
             lines += [] if strip else [line]
-        elif part.geom_type == "Point" and (circle := _circle(part, crs, said, name)) is not None:
+        elif part.geom_type == "Point" and (circle := _circle(part, crs, said, name, doubts)) is not None:
             circles.append(circle)
         else:
             unused[part.geom_type.lower()] += 1
-    found = Shapes(tuple(polygons), tuple(lines), tuple(circles), unused=shape_files.counted(unused))
+    left = shape_files.counted(unused)
+    found = Shapes(tuple(polygons), tuple(lines), tuple(circles), unused=left, doubts=tuple(sorted(doubts)))
     if not any_size:
         shape_files.refuse_many_corners([*found.areas, *lines], name)
     return found
 
 
-def _circle(point: Any, crs: str | None, said: dict[str, Any], name: str) -> Circle | None:
-    [lat, lon] = _degrees(point.coords, crs, name, 1)[0]
+def _circle(point: Any, crs: str | None, said: dict[str, Any], name: str, doubts: set[str]) -> Circle | None:
+    [lat, lon] = _degrees(point.coords, crs, name, doubts, 1)[0]
     return shape_files.circle_of(float(lat), float(lon), said, name)
 
 
@@ -243,15 +245,16 @@ def _parts_of(source: str, layer: str) -> Iterator[tuple[str | None, Any, dict[s
             yield meta["crs"], part, stated
 
 
-def _degrees(points: object, crs: str | None, name: str, least: int = 3) -> Ring:
+def _degrees(points: object, crs: str | None, name: str, doubts: set[str], least: int = 3) -> Ring:
     """A ring or line in latitude and longitude of WGS 84; InputError if its coordinate system is not known."""
     if crs is None:
         raise InputError(f"{name} does not say its coordinate system; export it in WGS 84 (EPSG:4326), with its .prj")
     array = np.asarray(points, dtype=np.float64)[:, :2]
     try:
-        lon_lat, _ = to_degrees(crs, array[:, 0], array[:, 1])
+        lon_lat, doubt = to_degrees(crs, array[:, 0], array[:, 1])
     except InputError as error:
         raise InputError(f"{name}: {error}; or export it in WGS 84 (EPSG:4326)") from None
+    doubts.update([doubt] if doubt else [])
     return shape_files.ring(lon_lat[:, ::-1], name, least)
 
 
@@ -356,6 +359,8 @@ def read_zones(path: Path) -> AreaFile:
     file = read_shapes(path, any_size=True)
     shapes = file.shapes
     refuse_no_zones(shapes, str(path), mission=bool(file.no_fly))
+    if shapes.doubts:
+        raise InputError(f"{path}: {shapes.doubts[0]}, as it does for zones to keep out of")
     shapes = replace(shapes, polygons=shapes.polygons + shapes.hidden, hidden=())
     if not shapes.polygons and not shapes.circles and not file.no_fly:
         raise InputError(f"{path} holds no polygon to keep out of; give a polygon with --no-fly")

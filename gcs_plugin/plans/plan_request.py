@@ -87,6 +87,7 @@ class PlanRequest:
         wind_m_s, wind_from_deg: wind and where it comes from, clockwise from north; the speed is that through the air.
         heading: direction of the lines over an area, as in PlanOptions. cross: cover it again by lines across these.
         gimbal_pitch_deg: to which missions turn the camera's gimbal, -90 straight down; None to leave it alone.
+        quickest_s: shortest time between two pictures of its cameras, None for the configuration's.
         config: margins, and times of flight of the autopilots.
     """
 
@@ -124,6 +125,7 @@ class PlanRequest:
     heading: Heading | None = None
     cross: bool = False
     gimbal_pitch_deg: float | None = -90.0
+    quickest_s: float | None = None
     config: Config = DEFAULT
 
     def _motion(self) -> Motion:
@@ -173,7 +175,7 @@ class PlanRequest:
             wait_s=60.0 * self.wait_min,
             heading=self.heading,
             cross=self.cross,
-            quickest_s=self.config.planning.quickest_s,
+            quickest_s=self.config.planning.quickest_s if self.quickest_s is None else self.quickest_s,
         )
 
 
@@ -258,7 +260,8 @@ def _not_flown(path: Path, shapes: Shapes, *, lines: bool = False) -> list[str]:
     beside = counted({"polygon": len(shapes.areas)} if lines and shapes.areas else {})
     beside += counted({"line": len(shapes.lines)} if shapes.lines and not lines else {})
     left = [*shapes.left, *beside]
-    notes = [f"of {path.name} this is not flown: {', '.join(left)}"] if left else []
+    notes = [f"{path.name}: {doubt}" for doubt in dict.fromkeys(shapes.doubts)]
+    notes += [f"of {path.name} this is not flown: {', '.join(left)}"] if left else []
     if lines and any(map(_closed, shapes.lines)):
         notes.append(
             f"{path.name} has a closed path, which is flown as a line; draw a polygon to cover what it surrounds"

@@ -262,7 +262,7 @@ def area_of(data: bytes, name: str) -> dict[str, Any]:
         "lines": [[[lon, lat] for lat, lon in line.tolist()] for line in shapes.lines],
         "no_fly": [_closed(zone) for zone in zones],
         "settings": settings,
-        "unused": [*shapes.left, *unplanned, *survey.left],
+        "unused": [*shapes.left, *shapes.doubts, *unplanned, *survey.left],
     }
 
 

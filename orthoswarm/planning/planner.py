@@ -273,8 +273,8 @@ def _warnings(schedule: Schedule, work: Work, foot: Footprint, options: PlanOpti
     every_s = foot.trigger_m / options.motion.speed_m_s
     if every_s < options.quickest_s:
         result.append(
-            f"a picture every {every_s:.2f} s is more than most cameras take; fly slower or higher, or with less "
-            "forward overlap"
+            f"a picture every {every_s:.2f} s is more than cameras take that need {options.quickest_s:g} s; fly slower "
+            "or higher, or with less forward overlap"
         )
     if work.balance > _FAIR_ENOUGH:
         result.append(

@@ -12,6 +12,8 @@ import pytest
 import shapely
 from fastapi import Request
 
+from gcs_plugin.cli.main import main
+from gcs_plugin.plans.area_files import read_zones
 from gcs_plugin.web.uploads import area_of, read_area
 from orthoswarm.model.errors import InputError
 from orthoswarm.planning.area.area import make_area
@@ -188,3 +190,13 @@ def test_an_area_of_an_ellipsoid_without_a_datum_is_refused(tmp_path):
     path = written(tmp_path, "area.gpkg", "+proj=utm +zone=32 +ellps=bessel +units=m", "GPKG")
     with pytest.raises(InputError, match="no datum"):
         area_of(path.read_bytes(), "area.gpkg")
+
+
+def test_an_old_datum_without_a_good_table_is_said_and_no_zone_is_made_of_it(tmp_path):
+    path = written(tmp_path, "area.gpkg", "EPSG:31468", "GPKG")  # Germany's before ETRS89, to 3 m
+    assert any("to 3 m only" in text for text in area_of(path.read_bytes(), "area.gpkg")["unused"])
+    with pytest.raises(InputError, match="to 3 m only"):
+        read_zones(path)
+    assert main(["plan", str(path), "--vehicles", "1", "--altitude", "60", "--fov-min", "60", "--json", "--out",
+                 str(tmp_path / "o")]) == 0  # fmt: skip
+    assert "to 3 m only" in (tmp_path / "o" / "plan.json").read_text()

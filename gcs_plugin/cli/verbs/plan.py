@@ -134,7 +134,8 @@ def _request(args: argparse.Namespace) -> tuple["PlanRequest", list[str]]:
     surveyed, notes = _survey(values) if values["area"].suffix.lower() == ".plan" and not args.gaps else ({}, [])
     values = surveyed | values
     if "altitude_m" not in values:
-        raise InputError("give the height of the lines with --altitude, metres")
+        why = "".join(f" ({note})" for note in notes)
+        raise InputError(f"give the height of the lines with --altitude, metres{why}")
     if "fov_min_deg" not in values:
         raise InputError("give the smallest field of view with --fov-min, or with --map the map that it was solved in")
     return PlanRequest(**values), notes

@@ -3,13 +3,16 @@
 import csv
 import io
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Final
 
 from gcs_plugin.mission.makers.drone_route import DroneRoute, RoutePoint, east_north_m
+from orthoswarm.model.angles import wrap_deg
 from orthoswarm.model.errors import InputError
 
 MOST_POINTS: Final = 99  # of DJI's Mobile SDK 4, by which Litchi flies
+_FARTHEST_M: Final = 1999.0  # ... which takes no two waypoints that are 2 km apart
 _ACTIONS: Final = range(1, 16)  # that a waypoint has columns for
 _STAY_FOR, _NONE = 0, -1  # kinds of actions
 _INTERPOLATE: Final = 2  # gimbalmode: the pitch of each waypoint
@@ -29,14 +32,15 @@ def is_litchi(text: str) -> bool:
 
 def litchi_text(route: DroneRoute) -> str:
     """The CSV of a route; raises InputError: it has more waypoints than Litchi takes."""
-    if len(route.points) > MOST_POINTS:
-        raise InputError(f"Litchi takes {MOST_POINTS} waypoints, not {len(route.points)}; give a shorter --endurance")
+    points = _within_reach(route.points)
+    if len(points) > MOST_POINTS:
+        raise InputError(f"Litchi takes {MOST_POINTS} waypoints, not {len(points)}; give a shorter --endurance")
     text = io.StringIO()
     table = csv.DictWriter(text, _COLUMNS, restval=0, lineterminator="\n")
     table.writeheader()
     idle = {f"actiontype{k}": _NONE for k in _ACTIONS} | {"photo_timeinterval": -1, "photo_distinterval": -1}
-    for number, point in enumerate(route.points):
-        east, north = east_north_m(*route.points[min(number, len(route.points) - 2) :][:2])
+    for number, point in enumerate(points):
+        east, north = east_north_m(*points[min(number, len(points) - 2) :][:2])
         row = idle | {"latitude": f"{point.lat_deg:.9f}", "longitude": f"{point.lon_deg:.9f}"}
         row |= {
             "altitude(m)": f"{point.height_m:.3f}",
@@ -51,6 +55,19 @@ def litchi_text(route: DroneRoute) -> str:
             row |= {"actiontype1": _STAY_FOR, "actionparam1": round(1000.0 * point.wait_s)}
         table.writerow(row)
     return text.getvalue()
+
+
+def _within_reach(points: Sequence[RoutePoint]) -> list[RoutePoint]:
+    """The points of a route, with others between those that are too far apart."""
+    near = list(points[:1])
+    for last, point in pairwise(points):
+        parts = math.ceil(math.hypot(*east_north_m(last, point)) / _FARTHEST_M)
+        for share in (k / parts for k in range(1, parts)):
+            lon = wrap_deg(last.lon_deg + share * wrap_deg(point.lon_deg - last.lon_deg))
+            lat, height = ((1.0 - share) * a + share * b for a, b in zip(last[:3:2], point[:3:2], strict=True))
+            near.append(RoutePoint(lat, lon, height, last.every_m))
+        near.append(point)
+    return near
 
 
 def parse_litchi(text: str, name: str) -> DroneRoute:

@@ -10,7 +10,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import KW_ONLY, dataclass, fields
 from typing import Any, Final
 from xml.etree import ElementTree
 
@@ -72,7 +72,9 @@ class Shapes:
     lines: tuple[Ring, ...] = ()  # its polylines, each float64 (n, 2), latitude and longitude in degrees
     circles: tuple[Circle, ...] = ()  # its circles
     hidden: tuple[Polygon, ...] = ()  # polygons that are switched off in the file (KML's visibility)
+    _: KW_ONLY
     unused: tuple[str, ...] = ()  # what else it holds, in words ("2 points")
+    doubts: tuple[str, ...] = ()  # what is uncertain about its places, a sentence each
 
     @property
     def areas(self) -> tuple[Polygon, ...]:
@@ -88,7 +90,7 @@ class Shapes:
     @classmethod
     def joined(cls, parts: Sequence["Shapes"]) -> "Shapes":
         """All shapes of several files or layers."""
-        return cls(*(tuple(shape for part in parts for shape in getattr(part, f.name)) for f in fields(cls)))
+        return cls(**{f.name: tuple(shape for part in parts for shape in getattr(part, f.name)) for f in fields(cls)})
 
 
 def ring(points: Any, name: str, least: int = 3) -> Ring:

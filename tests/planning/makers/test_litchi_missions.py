@@ -6,6 +6,8 @@ import pytest
 from litchi_wp.enums import ActionType, AltitudeMode, GimbalMode
 from litchi_wp.waypoint import Waypoint as LitchiWaypoint
 
+from gcs_plugin.mission.makers.drone_route import DroneRoute, RoutePoint
+from gcs_plugin.mission.makers.litchi import litchi_text
 from gcs_plugin.mission.makers.maker_files import maker_file, read_mission_file
 from gcs_plugin.mission.mission_files import DO_SET_CAM_TRIGG_DIST, NAV_LOITER_TIME, FileItem, sortie_items
 from gcs_plugin.plans.area_files import read_shapes
@@ -52,6 +54,16 @@ def test_a_mission_of_litchis_gives_lines_to_follow_and_items(tmp_path):
     timed = path.read_text().replace(",-1,10.000", ",2.5,-1")
     triggers = [i.params[0] for i in read_mission_file(timed.encode()).items if i.command == DO_SET_CAM_TRIGG_DIST]
     assert triggers == [20.0, 0.0, 20.0, 0.0]  # a picture each 2.5 s at 8 m/s
+
+
+def test_no_two_waypoints_are_two_kilometres_apart():
+    far = [RoutePoint(60.0, 10.0, 60.0, every_m=5.0), RoutePoint(60.0, 10.1, 90.0, wait_s=3.0)]  # 5.6 km
+    route = DroneRoute(points=tuple(far), speed_m_s=8.0, climb_m=60.0, pitch_deg=None, end="hover")
+    points = [LitchiWaypoint.from_line(line) for line in litchi_text(route).splitlines()[1:]]
+    assert [p.lon for p in points] == pytest.approx([10.0, 10.0 + 0.1 / 3, 10.0 + 0.2 / 3, 10.1])
+    assert [p.altitude.value for p in points] == pytest.approx([60.0, 70.0, 80.0, 90.0])
+    assert [p.photo.distance_interval for p in points] == [5.0, 5.0, 5.0, -1.0]
+    assert [p.actions[0].type for p in points] == [ActionType.NO_ACTION] * 3 + [ActionType.STAY_FOR]
 
 
 @pytest.mark.parametrize(

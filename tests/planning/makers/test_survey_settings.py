@@ -23,7 +23,8 @@ def surveyed(camera=None, style=None, **survey):
     document = survey_plan()
     entry = document["mission"]["items"][0]
     entry.update({"angle": 20, **survey})
-    entry["TransectStyleComplexItem"].update({"CameraCalc": {**CAMERA, **(camera or {})}, **(style or {})})
+    said = {key: value for key, value in {**CAMERA, **(camera or {})}.items() if value is not None}
+    entry["TransectStyleComplexItem"].update({"CameraCalc": said, **(style or {})})
     return document
 
 
@@ -64,6 +65,7 @@ def test_an_upright_camera_lies_across_by_its_height():
     [
         ({"DistanceMode": 2}, {}, {}, {"altitude_m"}, "50 m above the sea"),
         ({"DistanceMode": 3}, {}, {}, set(), "follows the ground"),
+        ({"DistanceMode": None, "DistanceToSurfaceRelative": False}, {}, {}, {"altitude_m"}, "50 m above the sea"),
         ({}, {"FollowTerrain": True}, {}, set(), "follows the ground"),
         ({"FocalLength": 0}, {}, {}, {"fov_min_deg", "aspect", "side_overlap", "forward_overlap"}, "names no lens"),
         ({"SideOverlap": "70"}, {"HoverAndCapture": True}, {}, {"side_overlap"}, "stops for each picture"),
@@ -103,6 +105,34 @@ def test_a_plan_takes_from_a_survey_what_is_not_given_and_says_so(tmp_path, caps
     assert (
         "taken: side overlap 70 %, forward overlap 70 %" in note and "lines at 20 degrees" in note.split("not taken")[1]
     )
+
+
+def test_only_surveys_and_corridors_are_flown_over(tmp_path, capsys):
+    document = surveyed()
+    survey = document["mission"]["items"][0]
+    tower = {
+        "complexItemType": "StructureScan",
+        "type": "ComplexItem",
+        "polygon": [[47.0, 9.0], [47.1, 9.0], [47.0, 9.1]],
+    }
+    document["mission"]["items"] = [tower, survey]
+    mission = parse_mission(json.dumps(document))
+    assert len(mission.surveys) == 1 and "its StructureScan" in mission.survey.left
+    document["mission"]["items"] = [tower]
+    flags = ("--altitude", "60", "--fov-min", "60")
+    assert "holds no polygon" in planned(tmp_path, capsys, document, *flags)
+
+
+def test_a_camera_that_needs_time_between_pictures_is_heard(tmp_path, capsys):
+    figures = planned(tmp_path, capsys, surveyed({"MinTriggerInterval": 3.0}))
+    assert any("at most one picture in 3 s" in text for text in figures["warnings"])
+    assert any("cameras take that need 3 s" in text for text in figures["warnings"])  # 11.8 m at 10 m/s
+    assert not any("cameras take" in text for text in planned(tmp_path, capsys, surveyed())["warnings"])
+
+
+def test_a_height_above_the_sea_is_said_where_the_height_is_asked_for(tmp_path, capsys):
+    document = surveyed({"DistanceMode": None, "DistanceToSurfaceRelative": False})
+    assert "the height of 50 m above the sea" in planned(tmp_path, capsys, document)
 
 
 def test_what_neither_a_survey_nor_the_user_says_is_asked_for(tmp_path, capsys):
