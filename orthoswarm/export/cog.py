@@ -27,6 +27,7 @@ from orthoswarm import __version__
 from orthoswarm.compute.jit import kernel
 from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.model.arrays import Bytes
+from orthoswarm.model.coordinate_system import require_map_system
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
 
@@ -330,8 +331,8 @@ def _directory(
 _DATE = "TIFFTAG_DATETIME"
 
 
-def convert_cog(source: Path, path: Path, *, epsg: int | None = None, jpeg_quality: int | None = None) -> None:
-    """Write a raster as a COG.
+def convert_cog(source: Path, path: Path, *, epsg: int | None = None, jpeg_quality: int | None = None) -> str:
+    """Write a raster as a COG; returns what is uncertain about its places in another coordinate system, else "".
 
     Args:
         source: a georeferenced RGBA raster. path: the file; appears when it is complete.
@@ -345,6 +346,7 @@ def convert_cog(source: Path, path: Path, *, epsg: int | None = None, jpeg_quali
     import rasterio
     from rasterio.errors import CRSError, RasterioError
     from rasterio.vrt import WarpedVRT
+    from rasterio.warp import transform_bounds
 
     lossless = {"compress": "DEFLATE", "predictor": 2}
     settings: dict[str, Any] = {
@@ -353,12 +355,16 @@ def convert_cog(source: Path, path: Path, *, epsg: int | None = None, jpeg_quali
         "overview_resampling": "AVERAGE",
         **(lossless if jpeg_quality is None else {"compress": "JPEG", "quality": jpeg_quality}),
     }
+    doubt = ""
     try:
         with rasterio.open(source) as raster, atomic_write(path) as part, rasterio.Env(CHECK_DISK_FREE_SPACE=True):
             crs = raster.crs if epsg is None else rasterio.crs.CRS.from_epsg(epsg)
             if crs == raster.crs:
                 copy_dataset(raster, part, **settings)
-                return
+                return ""
+            if epsg is not None:
+                west, south, east, north = transform_bounds(raster.crs, 4326, *raster.bounds)
+                doubt = require_map_system(epsg, [west, west, east, east], [south, north, south, north])
             with WarpedVRT(raster, crs=crs, resampling=rasterio.enums.Resampling.cubic, warp_mem_limit=64) as vrt:
                 # A warped raster has none of its source's tags: it is copied by way of a description that has.
                 date = raster.tags().get(_DATE)
@@ -371,6 +377,7 @@ def convert_cog(source: Path, path: Path, *, epsg: int | None = None, jpeg_quali
                         copy_dataset(file, part, **settings)
     except (CRSError, RasterioError) as error:
         raise InputError(f"{source.name} cannot be written as asked ({_first_line(error)}); check --epsg") from None
+    return doubt
 
 
 def _first_line(error: Exception) -> str:

@@ -123,8 +123,10 @@ def _cameras(kind: str, what: MapExport) -> Path:
 def _cog(what: MapExport) -> Path:
     from orthoswarm.export.cog import convert_cog
 
-    convert_cog(what.picture, what.file("tif"), epsg=what.epsg, jpeg_quality=what.quality if what.jpeg else None)
-    return what.file("tif")
+    path, quality = what.file("tif"), what.quality if what.jpeg else None
+    doubt = convert_cog(what.picture, path, epsg=what.epsg, jpeg_quality=quality)
+    what.notes.extend([doubt] if doubt else [])
+    return path
 
 
 def _stac(what: MapExport) -> Path:
@@ -149,7 +151,8 @@ def _pmtiles(what: MapExport) -> Path:
 def _pdf(what: MapExport) -> Path:
     from orthoswarm.export.sheets.geopdf import write_geopdf
 
-    write_geopdf(what.picture, what.file("pdf"), what.all_places, _title(what))
+    boxes = write_geopdf(what.picture, what.file("pdf"), what.all_places, _title(what))
+    what.notes.extend([f"no font here has {boxes}; install one that does, and export again"] if boxes else [])
     return what.file("pdf")
 
 

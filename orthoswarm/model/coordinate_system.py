@@ -43,20 +43,48 @@ def to_degrees(system: str, x: ArrayLike, y: ArrayLike) -> tuple[Array, str]:
     Raises:
         InputError: the system is not known, or only its ellipsoid is.
     """
-    from pyproj.exceptions import ProjError
-
     transformer, doubt = _transformer(system)
     lon, lat = transformer.transform(np.asarray(x, float), np.asarray(y, float))
-    try:
-        used = transformer.get_last_used_operation()
-    except ProjError:  # of degrees into the same degrees PROJ remembers none
-        used = transformer
-    if used.accuracy > _TOLD_M:
+    metres = _used_accuracy_m(transformer)
+    if metres > _TOLD_M:
         doubt = (
-            f"coordinates in '{system[:60]}' are turned into WGS 84 to {used.accuracy:.0f} m only (no better table of "
-            "the datum is here); give them in WGS 84 where that matters"
+            f"coordinates in '{system[:60]}' are turned into WGS 84 to {metres:.0f} m only (no better table of the "
+            "datum is here); give them in WGS 84 where that matters"
         )
     return np.stack([np.asarray(lon, float), np.asarray(lat, float)], axis=-1), doubt
+
+
+def require_map_system(epsg: int, lon: ArrayLike, lat: ArrayLike) -> str:
+    """Refuse a known system that a map about points (N,), in degrees, cannot be written in.
+
+    Returns what is uncertain about the map's places then, a sentence without its end; "" if the datums agree to 1 m.
+
+    Raises:
+        InputError: it is no system of maps, or not used there.
+    """
+    from pyproj import CRS
+
+    system = f"EPSG:{epsg}"
+    crs = CRS.from_user_input(system)
+    degrees = crs.is_geographic and all(axis.unit_name == "degree" for axis in crs.axis_info[:2])
+    if not (crs.is_projected or degrees):
+        raise InputError(f"{system} ({crs.name}) is no system for maps; give one in metres or in degrees")
+    transformer, doubt = _transformer(system)
+    x, y = transformer.transform(np.asarray(lon, float), np.asarray(lat, float), direction="INVERSE")
+    metres = _used_accuracy_m(transformer)
+    if not np.isfinite([x, y]).all() or share_in_area(system, x, y) < 1.0:
+        raise InputError(f"{system} ({crs.name}) is not used where this map lies; give the system of its country")
+    return f"places in {system} are good to {metres:.0f} m (no better table is here)" if metres > _TOLD_M else doubt
+
+
+def _used_accuracy_m(transformer: Any) -> float:
+    """The accuracy of what a transformer did last, metres; negative if it is not known."""
+    from pyproj.exceptions import ProjError
+
+    try:
+        return float(transformer.get_last_used_operation().accuracy)
+    except ProjError:  # of degrees into the same degrees PROJ remembers none
+        return float(transformer.accuracy)
 
 
 def require_datum(system: str, name: str) -> None:

@@ -6,6 +6,7 @@ import re
 import sqlite3
 import zipfile
 from pathlib import Path
+from urllib.parse import urljoin
 
 import jsonschema
 import numpy as np
@@ -163,6 +164,24 @@ def varints(data):
         if byte < 128:
             yield value
             value = shift = 0
+
+
+def test_signs_of_addresses_in_a_folder_name_are_part_of_it(folder, tmp_path):
+    odd = tmp_path / "flood #3 50%? ü"
+    odd.mkdir()
+    write_mbtiles(folder / "orthoimage.tif", odd / "m.mbtiles", tile_format="webp")
+    write_pmtiles(odd / "m.mbtiles", odd / "m.pmtiles")
+    assert (odd / "m.pmtiles").read_bytes()[:7] == b"PMTiles"
+    (odd / "o.tif").write_bytes((folder / "orthoimage.tif").read_bytes())
+    write_stac_item(odd / "o.tif", tmp_path / "item.json")
+    href = json.loads((tmp_path / "item.json").read_text())["assets"]["orthoimage"]["href"]
+    assert urljoin("file:///maps/item.json", href) == "file:///maps/flood%20%233%2050%25%3F%20%C3%BC/o.tif"
+
+
+def test_letters_that_no_font_here_has_are_told(folder, tmp_path):
+    assert write_geopdf(folder / "orthoimage.tif", tmp_path / "b.pdf", [FIND], "Überflutung, Потоп") == ""
+    missing = chr(0x10FFFD)
+    assert write_geopdf(folder / "orthoimage.tif", tmp_path / "c.pdf", [FIND], f"A {missing} B") == missing
 
 
 def test_pmtiles_hold_every_tile_under_its_number(folder, tmp_path):

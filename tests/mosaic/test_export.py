@@ -308,8 +308,26 @@ def test_a_cog_in_another_system_and_as_jpeg(ortho, tmp_path):
         assert image.profile["compress"] == "jpeg" and image.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
         assert image.dataset_mask()[0, 0] == 0
     assert (tmp_path / "j.tif").stat().st_size < 0.5 * ortho.stat().st_size
-    with pytest.raises(InputError):
-        convert_cog(ortho, tmp_path / "n.tif", epsg=999_999)
+
+
+@pytest.mark.parametrize(
+    ("epsg", "why"),
+    [
+        (999_999, "check --epsg"), (4978, "no system for maps"), (5703, "no system for maps"),
+        (4807, "no system for maps"), (2193, "not used where"), (32_655, "not used where"), (3031, "not used where"),
+    ],
+)  # fmt: skip
+def test_a_system_that_a_map_cannot_be_written_in_is_refused(ortho, tmp_path, epsg, why):
+    with pytest.raises(InputError, match=why):
+        convert_cog(ortho, tmp_path / "n.tif", epsg=epsg)
+    assert not list(tmp_path.glob("n.tif*"))
+
+
+def test_what_is_uncertain_about_a_system_is_told(ortho, tmp_path):
+    assert convert_cog(ortho, tmp_path / "a.tif", epsg=31468) == (
+        "places in EPSG:31468 are good to 3 m (no better table is here)"
+    )
+    assert convert_cog(ortho, tmp_path / "b.tif", epsg=25832) == ""
 
 
 def test_what_gdal_cannot_write_is_an_error_of_the_system(ortho, tmp_path):

@@ -2,7 +2,9 @@
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -48,8 +50,10 @@ class _Frame:
         return self.box[0] + (east_m - self.west) / self.metres, self.box[1] + (self.north - north_m) / self.metres
 
 
-def write_geopdf(cog: Path, path: Path, places: Sequence[Place] = (), title: str = "Orthoimage") -> None:
+def write_geopdf(cog: Path, path: Path, places: Sequence[Place] = (), title: str = "Orthoimage") -> str:
     """Write an orthoimage as one sheet of A3 at the greatest round scale at which it fits.
+
+    Returns the letters of title and finds that no font here has, and that are boxes on the sheet.
 
     Args:
         cog: the orthoimage, in a projected system in metres; `report.json` and `frames.jsonl` beside it give accuracy
@@ -83,6 +87,8 @@ def write_geopdf(cog: Path, path: Path, places: Sequence[Place] = (), title: str
     page = _page(frame, rgba, epsg, cog=cog, places=places, title=title)
     with atomic_write(path) as part:
         _save(page, frame, epsg, part, title)
+    names = {title, *(place.name for place in places if place.kind == "find")}
+    return "".join(sorted({letter for name in names for letter in _font_file(name)[1]}))
 
 
 def _drawn(raster: Any) -> BoundingBox:
@@ -160,7 +166,7 @@ def _mark(draw: "ImageDraw", at: tuple[float, float], name: str, frame: _Frame) 
     if left <= x <= right and top <= y <= bottom:
         size = 2.2 * _MM
         draw.ellipse((x - size, y - size, x + size, y + size), outline=_MARK, width=5)
-        font = _font(3.2)
+        font = _font(3.2, name)
         draw.text((x + 1.4 * size, y), name[:60], _MARK, font, "lm", stroke_width=3, stroke_fill="white")
 
 
@@ -182,7 +188,7 @@ def _foot(draw: "ImageDraw", frame: _Frame, grid: LocalGrid, *, cog: Path, finds
         *_wrapped(stated.sentence if stated else "There is no report that states the accuracy.", right - left),
     ]
     y = bottom + 4.0 * _MM
-    draw.text((left, y), title[:80], fill=_INK, font=_font(6.0))
+    draw.text((left, y), title[:80], fill=_INK, font=_font(6.0, title))
     for k, line in enumerate(lines):
         draw.text((left, y + (9.0 + 5.0 * k) * _MM), line, fill=_INK, font=_font(3.0))
     y += (12.0 + 5.0 * len(lines)) * _MM
@@ -222,13 +228,32 @@ def _degrees(value: float, letters: str) -> str:
     return f"{abs(value):.5f}° {letters[value < 0]}"
 
 
-def _font(height_mm: float) -> Any:
-    import matplotlib
+def _font(height_mm: float, text: str = "") -> Any:
     from PIL import ImageFont
 
-    return ImageFont.truetype(
-        Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf", round(height_mm * _MM)
-    )
+    return ImageFont.truetype(_font_file(text)[0], round(height_mm * _MM))
+
+
+@lru_cache(maxsize=256)
+def _font_file(text: str) -> tuple[Path, frozenset[str]]:
+    """The font of a text, one of this machine where our own lacks letters; and the letters that it lacks, too."""
+    import matplotlib
+    from matplotlib.ft2font import FT2Font
+
+    def lacks(path: Path) -> frozenset[str]:
+        known = FT2Font(str(path)).get_charmap()
+        return frozenset(letter for letter in text if not letter.isspace() and ord(letter) not in known)
+
+    own = Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"
+    if not (missing := lacks(own)):
+        return own, missing
+    from matplotlib.font_manager import findSystemFonts
+
+    for path in sorted(map(Path, findSystemFonts())):
+        with suppress(RuntimeError, OSError):  # fonts of kinds that FreeType does not read
+            if not lacks(path):
+                return path, frozenset()
+    return own, missing
 
 
 def _save(page: Any, frame: _Frame, epsg: int, path: Path, title: str) -> None:

@@ -70,11 +70,11 @@ def write_pack(
         tiles = folder / "orthoimage.mbtiles"
         title = cog.resolve().parent.name or "map"
         bounds: list[tuple[float, ...]] = []
-        web: list[Callable[[], None]] = [
+        web: list[Callable[[], object]] = [
             lambda: bounds.append(_draw_tiles(cog, tiles, folder / "orthoimage.kmz")),
             lambda: write_pmtiles(tiles, folder / "orthoimage.pmtiles"),
         ]
-        others: list[Callable[[], None]] = [
+        others: list[Callable[[], object]] = [
             lambda: write_geopdf(cog, folder / "sheet.pdf", places, title),
             lambda: write_data_package(places, folder / "places-tak.zip", title),
             *(partial(write, places, folder / name) for name, write in PLACE_FILES.items()),
@@ -84,7 +84,7 @@ def write_pack(
         done = itertools.count(1)
         count = len(web) + len(others) + 1
 
-        def run(steps: Sequence[Callable[[], None]]) -> None:
+        def run(steps: Sequence[Callable[[], object]]) -> None:
             for step in steps:
                 step()
                 tell(next(done), count)

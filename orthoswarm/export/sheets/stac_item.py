@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -86,8 +87,8 @@ def raster_item(
 
 
 def _relative(file: Path, document: Path) -> str:
-    """How a document names a file, relatively to itself."""
-    return Path(os.path.relpath(file, document.parent)).as_posix()
+    """How a document names a file, relatively to itself, as a URL."""
+    return quote(Path(os.path.relpath(file, document.parent)).as_posix())
 
 
 def _properties(cog: Path) -> dict[str, Any]:

@@ -137,7 +137,10 @@ def write_pmtiles(mbtiles: Path, path: Path) -> None:
     from pmtiles.writer import Writer
 
     try:
-        with closing(sqlite3.connect(f"file:{mbtiles}?mode=ro", uri=True)) as database, atomic_write(path) as part:
+        with (
+            closing(sqlite3.connect(mbtiles.absolute().as_uri() + "?mode=ro", uri=True)) as database,
+            atomic_write(path) as part,
+        ):
             about = dict(database.execute("SELECT name, value FROM metadata"))
             places = database.execute("SELECT zoom_level, tile_column, tile_row FROM tiles")
             numbered = sorted((zxy_to_tileid(z, x, 2**z - 1 - row), z, x, row) for z, x, row in places)
