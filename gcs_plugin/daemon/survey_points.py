@@ -6,6 +6,7 @@ picture's place; where it does is marked. What is marked is written as ODM's gcp
 
 import tempfile
 import threading
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, TypedDict
@@ -94,7 +95,7 @@ class SurveyPoints:
             read = read_checkpoints(path)
         if len(read) > _MOST_POINTS:
             raise InputError(f"the table holds {len(read)} points; send at most {_MOST_POINTS}")
-        frames = {row.image: row for row in all_frames(self._journal)} if any(p.marks for p in read) else {}
+        frames = self._by_name() if any(p.marks for p in read) else {}
         with self._lock:
             known = {point["name"]: point for point in self._points()}
             points = []
@@ -108,6 +109,12 @@ class SurveyPoints:
             self._journal.remember("points", points)
         self._events.tell("points")
         return self.rows()
+
+    def _by_name(self) -> dict[str, FrameRow]:
+        """Pictures by what a table calls them: their names, with the vehicle as folder where several have one."""
+        rows = list(all_frames(self._journal))
+        count = Counter(row.image for row in rows)
+        return {row.image if count[row.image] == 1 else f"{row.vehicle}/{row.image}": row for row in rows}
 
     def mark(self, body: Mapping[str, Any]) -> list[PointRow]:
         """Mark a point (`name`) in a picture (`seq`) at `column` and `row`, or not any more where these are null.
@@ -146,13 +153,14 @@ class SurveyPoints:
         Raises:
             InputError: a picture's name has a blank, which ends a name there.
         """
-        marks = [(row, mark) for row in self.rows() for mark in row["marks"]]
-        if blank := next((mark["image"] for _, mark in marks if len(mark["image"].split()) != 1), None):
+        names = {row.seq: name for name, row in self._by_name().items()}
+        marks = [(row, mark, names[mark["seq"]]) for row in self.rows() for mark in row["marks"]]
+        if blank := next((name for *_, name in marks if len(name.split()) != 1), None):
             raise InputError(f"{blank} has a blank in its name, which gcp_list.txt cannot hold; take away its mark")
         lines = [
-            f"{row['lon_deg']:.9f} {row['lat_deg']:.9f} NaN {mark['column']:.2f} {mark['row']:.2f} {mark['image']} "
+            f"{row['lon_deg']:.9f} {row['lat_deg']:.9f} NaN {mark['column']:.2f} {mark['row']:.2f} {name} "
             + "_".join(row["name"].split())
-            for row, mark in marks
+            for row, mark, name in marks
         ]
         return "\n".join(["EPSG:4326", *lines, ""])
 

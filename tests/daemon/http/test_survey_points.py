@@ -92,3 +92,21 @@ def test_what_makes_no_sense_is_refused(served, shots):
     assert outside.status_code == 422 and "a point is marked at 5000, 5000" in outside.text
     assert served.get("/api/points/pictures?name=nobody").status_code == 422
     assert served.get("/api/points").json()[0]["marks"] == []
+
+
+def test_pictures_of_one_name_are_told_apart_by_their_vehicle(tmp_path):
+    with serving(tmp_path / "w") as served:
+        for shot in [*line(2, "v1"), *line(2, "v2", east=10)]:
+            assert served.send(shot).status_code == 201
+        served.until("/api/frames", lambda rows: len(rows) == 4 and all(row["on_map"] for row in rows))
+        put(served, f"name,lat_deg,lon_deg\n{NAME},48.0,11.0\n")
+        frames = served.get("/api/frames").json()
+        for row in frames:
+            assert mark(served, seq=row["seq"], column=row["seq"], row=5.0).status_code == 200
+        table = served.get("/api/points/gcp_list.txt").text
+        names = {text.split()[5] for text in table.splitlines()[1:]}
+        assert names == {f"{row['vehicle']}/{row['image']}" for row in frames} and len(names) == 4
+        put(served, "name,lat_deg,lon_deg\nother,10.0,20.0\n")
+        (again,) = put(served, table).json()
+        marks = {(m["seq"], m["vehicle"], m["column"]) for m in again["marks"]}
+        assert marks == {(row["seq"], row["vehicle"], row["seq"]) for row in frames}
