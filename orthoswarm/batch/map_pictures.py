@@ -24,7 +24,7 @@ from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import last_time
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import PlacedFrame, Refinement, Solution, Terrain
-from orthoswarm.mosaic.confidence import confidence, drawn_cells
+from orthoswarm.mosaic.confidence import confidence, drawn_cells, trim_edge
 from orthoswarm.mosaic.extent import drawn_window, ground_level, placed_bounds
 from orthoswarm.mosaic.footprint import default_gsd, rejection
 from orthoswarm.mosaic.kernels.downsampling import reduction
@@ -188,6 +188,8 @@ def draw(
         else:
             seams = _seams(run, state) if name == ORTHOIMAGE else None
             stats = render(reading.frames(placed), terrain, canvas, gains=state.gains, seams=seams, **how)
+        if name == ORTHOIMAGE and run.options.edge == "trim":
+            trim_edge(canvas, placed, terrain)
         _write(run, canvas, name, placed)
         if name == ORTHOIMAGE:
             _write_about(run, state, canvas, placed, terrain)

@@ -82,7 +82,8 @@ class MapOptions:
         dem: raster of ground heights. split_legs: treat each leg of a vehicle as a separate vehicle.
         gains: balance brightness between pictures. tone: where brightness and hue of large areas come from, used with
             gains and a basemap on which pictures were found.
-        blend: mix the two pictures at each seam, see Seams.
+        blend: mix the two pictures at each seam, see Seams. edge: of the orthoimage, all that was seen, or trimmed to
+            what several pictures see.
         control: surveyed points that move the map onto the ground; checkpoints: others that it is measured at (files
             as of evaluation.checkpoints). pixel_scale: pixels of the photos to one of those in which they were marked.
         temperature: write `temperature.tif`, of thermal pictures, see export.temperature; kelvin of a count of 16
@@ -106,6 +107,7 @@ class MapOptions:
     gains: bool = True
     tone: Literal["photos", "map"] = "photos"
     blend: Blend = "seam"
+    edge: Literal["all", "trim"] = "all"
     control: Path | None = None
     checkpoints: Path | None = None
     pixel_scale: float = 1.0

@@ -38,6 +38,7 @@ _CELL_M: Final = 1.0  # least side of a cell
 _MOST_CELLS: Final = 2_000_000  # cells are larger where there would be more (memory, time)
 _CUT_SHARE: Final = 0.05  # a second picture with less of an object only touches its edge
 _CUT_M: Final = 1.0  # objects are higher than this
+_TEETH_M: Final = 6.0  # sigma by which the outline is smoothed: pictures are a few times as far apart
 _SIDE: Final = 0.05  # so much of what is drawn lies along each side
 _DOUBTFUL_SIDE: Final = 0.4  # share of it that makes a side one for orientation
 _CHANGED_TONE: Final = 1.5  # colours that were multiplied or divided by more are not the picture's own
@@ -165,6 +166,30 @@ def drawn_cells(canvas: Canvas) -> tuple[GroundGrid, Ints]:
         some = plane[px // 2 :: px, px // 2 :: px]
         out[(row - row0) // px :][: len(some), : some.shape[1]] = some
     return cells, out
+
+
+def trim_edge(canvas: Canvas, frames: Sequence[PlacedFrame], terrain: Terrain) -> None:
+    """Take away from a canvas what lies outside of the ground that several frames see; no teeth of single ones remain.
+
+    frames, terrain: what it was drawn from, as of `confidence`.
+    """
+    grid, shown = drawn_cells(canvas)
+    count = np.where(shown > 0, _pictures(grid, frames, terrain), 0)
+    usual = int(np.median(count[shown > 0])) if shown.any() else 0
+    well = np.pad((count >= min(_LEAST_PICTURES, usual // 2)) & (shown > 0), 1).astype(np.float32)
+    well = cv2.GaussianBlur(well, None, _TEETH_M / grid.gsd_m)
+    _, parts = cv2.connectedComponents((well < 0.5).astype(np.uint8))
+    well[(parts != parts[0, 0]) & (well < 0.5)] = 1.0  # what is seen by few within the map stays
+    for key in canvas.changed_since(0):
+        box, step = canvas.tile_bounds(key), canvas.grid.gsd_m / grid.gsd_m
+        x, y = grid.to_pixel([box.west + 0.5 * canvas.grid.gsd_m, box.north - 0.5 * canvas.grid.gsd_m]) + 1.0
+        to_cells = np.array([[step, 0.0, x], [0.0, step, y]])
+        size, how = (canvas.tile_px, canvas.tile_px), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        away = cv2.warpAffine(well, to_cells, size, flags=how) < 0.5
+        if away.any():
+            tile = canvas.begin(key)
+            tile.rgba[away], tile.plane[away] = 0, 0
+            canvas.commit(key)
 
 
 def _pictures(grid: GroundGrid, frames: Sequence[PlacedFrame], terrain: Terrain) -> Ints:

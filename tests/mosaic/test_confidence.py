@@ -2,12 +2,13 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.model.placement import Terrain
-from orthoswarm.mosaic.confidence import ORIENTATION_ONLY, confidence, drawn_cells
+from orthoswarm.mosaic.confidence import ORIENTATION_ONLY, confidence, drawn_cells, trim_edge
 from orthoswarm.mosaic.renderer import render
 from tests.kit import mosaic_scene as scene
 
@@ -102,3 +103,23 @@ def test_recorded_poses_are_for_orientation(drawn):
 def test_an_object_that_several_pictures_show_is_cut(drawn):
     _, found = drawn(with_box(on_top=True))
     assert (found.objects, found.cut) == (1, 1)
+
+
+def test_a_trimmed_outline_has_no_teeth_and_keeps_what_several_pictures_see(tmp_path):
+    flight = scene.survey(1, tilt_deg=0.0)
+    frames = [replace(f, sigma_m=0.02, stage="fine") for f in flight.frames]
+    canvas = Canvas.create(tmp_path / "canvas", scene.grid(260.0), plane="frame", tile_px=128)
+    render(frames, Terrain.flat(0.0), canvas, read=flight.read)
+    before = confidence(*drawn_cells(canvas), frames, Terrain.flat(0.0), [None] * len(frames))
+    whole = canvas.read_plane(0, canvas.grid.height, 0, canvas.grid.width) > 0
+    trim_edge(canvas, frames, Terrain.flat(0.0))
+    left = canvas.read_plane(0, canvas.grid.height, 0, canvas.grid.width) > 0
+    assert (canvas.read(0, canvas.grid.height, 0, canvas.grid.width)[..., 3] > 0).tolist() == left.tolist()
+    assert not (left & ~whole).any() and 0.6 * whole.sum() < left.sum() < whole.sum()
+    cell = np.floor(before.grid.to_pixel(canvas.grid.to_ground(np.argwhere(whole & ~left)[:, ::-1])) + 0.5).astype(int)
+    count = before.pictures[tuple(cell.clip(0, np.array(before.pictures.shape)[::-1] - 1).T[::-1])]
+    assert np.mean(count < 3) > 0.8  # the rest are the corners that were rounded
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * round(5.0 / canvas.grid.gsd_m) + 1,) * 2)
+    round_ = [cv2.morphologyEx(m.astype(np.uint8), cv2.MORPH_OPEN, disc).sum() / m.sum() for m in (whole, left)]
+    assert 1.0 - round_[1] < min(0.2 * (1.0 - round_[0]), 0.002)
+    canvas.close()

@@ -98,6 +98,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--tone", choices=("photos", "map"), default="photos",
         help="brightness and hue of large areas: as the photos have it (default), or as the basemap has",
     )  # fmt: skip
+    add("--edge", choices=("all", "trim"), default="all", help="the orthoimage's edge: all, or what several photos see")
     add("--blend", choices=("none", "seam"), default="seam", help="blend pictures over a few pixels at seams, or not")
     add(
         "--temperature", type=float, nargs="?", const=0.0, metavar="KELVIN",
