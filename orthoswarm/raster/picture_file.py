@@ -34,6 +34,9 @@ take 0.6 GB in colour. A file of some hundred kilobytes can hold a picture that 
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _TIFF: Final = (b"II*\0", b"MM\0*")
+_MARKER: Final = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")  # of a JPEG, besides those within a scan
+_STRAY_BYTES: Final = 15  # so many bytes of any value may follow a JPEG's scan: cameras write words of up to 16 bytes
+_LARGE_BLOCK: Final = 24  # ... if 16 x 16 pixels take more in the mean: a decoder reads up to 8 bytes ahead, unseen
 _DEEP: Final = (np.uint16, np.float32)
 _DEPTH_PICTURES: Final = 9  # pictures of a folder that tell the range of its 16-bit pictures (for its time)
 
@@ -137,15 +140,46 @@ def _decode_jpeg(path: Path, data: bytes, colors: str, *, fast_upsample: bool, f
     import simplejpeg
 
     width, height = _jpeg_size(data) if factor > 1 else (0, 0)  # 0: as large as it is
-    try:
-        return np.asarray(
-            simplejpeg.decode_jpeg(
-                data, colorspace=colors, fastdct=True, fastupsample=fast_upsample,
-                min_width=-(-width // factor), min_height=-(-height // factor),
-            )
-        )  # fmt: skip
-    except ValueError as error:
-        raise PictureError.of(path, "is a damaged JPEG; copy it again from the camera", str(error)) from None
+    fault = ""
+    for jpeg in _without_filler(data):
+        try:
+            return np.asarray(
+                simplejpeg.decode_jpeg(
+                    jpeg, colorspace=colors, fastdct=True, fastupsample=fast_upsample,
+                    min_width=-(-width // factor), min_height=-(-height // factor),
+                )
+            )  # fmt: skip
+        except ValueError as error:
+            fault = fault or str(error)
+    raise PictureError.of(path, "is a damaged JPEG; copy it again from the camera", fault)
+
+
+def _without_filler(data: bytes) -> Iterator[bytes]:
+    """A JPEG as it is, then without bytes between its scan and its end, which some cameras write: one value, or a few.
+
+    That they stood behind the last block is shown by decoding the rest without a warning: without a part of the scan it
+    ends too early. A scan that lost or won bytes in the middle ends too late as well, but by whole blocks.
+    """
+    yield data
+    end = _end_of_scan(data)
+    run = end - len(data[:end].rstrip(data[end - 1 : end]))
+    width, height = _jpeg_size(data)
+    large = len(data) * 16 * 16 > _LARGE_BLOCK * width * height
+    stray = range(1, _STRAY_BYTES + 1) if large and 0 < run <= _STRAY_BYTES else ()
+    filler = (run, run - 1) if 1 < run < end else ()  # the scan may end in the same value
+    for count in dict.fromkeys((*filler, *stray)):
+        yield data[: end - count] + data[end:]
+
+
+def _end_of_scan(data: bytes) -> int:
+    """Where a JPEG's end marker is, 0 if it has none; thumbnails before it and previews behind it have their own."""
+    at = 2
+    while marker := _MARKER.search(data, at):
+        at = marker.start()
+        if data[at + 1] == 0xD9:
+            return at
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return 0
 
 
 def picture_size(data: bytes, formats: Sequence[str] | None = None) -> tuple[int, int, str]:

@@ -13,6 +13,9 @@ from itertools import islice
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.earth import distance_m
 from orthoswarm.model.frame import UNSTATED_SIGMA_M, Ingest, Rejection
 from orthoswarm.model.task_runner import Progress
@@ -38,8 +41,8 @@ from telemetry.ingest.track_poses import SHIFTED, clock_went_back, in_order
 from telemetry.ingest.video_ingest import read_videos
 from telemetry.photos.flight_checks import flight_findings, times_without_zone
 from telemetry.photos.maker_angles import Angles
-from telemetry.photos.photo_frames import frame_without_position, frames_of, settle_positions
-from telemetry.photos.photo_tags import Photo, read_photos, with_sidecar
+from telemetry.photos.photo_frames import frame_without_position, frames_of, settle_positions, void_fixes
+from telemetry.photos.photo_tags import ALTITUDE_CONTRADICTS_M, Photo, read_photos, with_sidecar
 from telemetry.samples.findings import Finding, metres, plural
 from telemetry.samples.held_fixes import LOST_SIGMA_M, coarse_m, held_fixes, matters, one_fix, stated_sigma_m
 from telemetry.samples.unreadable import Unreadable, read_or_reason
@@ -51,8 +54,11 @@ _CONTRADICTION_M: Final = 500.0  # table that puts a photo so far from its tags,
 
 
 _NOT_MEASURED: Final = (
-    "the picture has no position: its receiver stood still; put a geo.txt next to it, or give its log as well"
+    "the picture has no position: its receiver stood still or had no fix; put a geo.txt next to it, or give its log as "
+    "well"
 )
+_FOOT_M: Final = 0.3048
+_LIKE_FEET: Final = 0.05  # share by which altitudes in feet may be off: sea and ellipsoid, and barometers, differ
 _COARSE_TOLD_M: Final = 3.0  # steps of coordinates that are more than receivers err
 _ROUNDED: Final = 12.0**-0.5  # sigma of what was rounded, in its steps
 
@@ -262,7 +268,7 @@ def _photo_folder(
     named = folder.path.name if folder.path == found.root else found.name(folder.path)
     source = SourceInfo(path=named, kind="photos")
     groups: dict[str, list[Photo]] = {}
-    seen, moved_m, twice = 0, list[float](), 0
+    seen, moved_m, raised_m, twice = 0, list[float](), list[tuple[float, float]](), 0
     finished = {path.with_suffix("") for path in folder.pictures if path.suffix.lower() != RAW_SUFFIX}
     for path, photo in zip(folder.pictures, tags, strict=True):
         if photo is None:
@@ -277,7 +283,10 @@ def _photo_folder(
             continue
         if path in folder.sidecars:
             photo = _with_sidecar(photo, folder.sidecars[path], found, source)
+        own_m = photo.altitude_m
         vehicle = _merge_tables(photo, path, tables, moved_m) or folder.vehicle
+        if photo.altitude_m != own_m and photo.altitude_m is not None and own_m is not None:
+            raised_m.append((photo.altitude_m, own_m))
         groups.setdefault(vehicle, []).append(photo)
     if twice:
         text = f"{plural(twice, 'raw picture')} not used: a finished picture of the same exposure lies beside each"
@@ -288,6 +297,7 @@ def _photo_folder(
             "another table say; the last table by name counts: check it, or take it away"
         )
         source.findings.append(Finding("positions-contradict", text))
+    source.findings += _altitudes_contradict(np.array(raised_m).reshape(-1, 2))
     for vehicle in sorted(groups, key=natural_key):
         photos = sorted(groups[vehicle], key=lambda p: natural_key(p.path.name))
         photos.sort(key=lambda p: math.inf if p.time_s is None else p.time_s)
@@ -383,22 +393,24 @@ def _measured(
 ) -> list[Photo]:
     """Photos whose receiver measured; others lie between those before and after, or are left out without a position."""
     places = [(p.lat_deg or 0.0, p.lon_deg or 0.0) for p in photos]
-    held = held_fixes([p.time_s for p in photos], places)
+    void = void_fixes(photos)
+    held = held_fixes([p.time_s for p in photos], places, void)
     lost = set(one_fix(places))
     if lost:
         many = f"all {len(photos)}" if len(lost) == len(photos) else f"{len(lost)} of {len(photos)}"
         text = f"{many} photos tell one place to the last digit: the receiver stood still, it is not used"
         source.findings.append(Finding("position-held", text, vehicle))
+    lost |= void.difference(held.index)
     for i, lat, lon, sigma in held.each():
         if sigma > LOST_SIGMA_M:
             lost.add(i)
             continue
         photos[i].lat_deg, photos[i].lon_deg = lat, lon
         photos[i].position_sigma_m = stated_sigma_m(photos[i].position_sigma_m, sigma)
-        photos[i].origin["position"] = "between the photos before and after, as the receiver stood still"
-    if matters(held):
+        photos[i].origin["position"] = "between the photos before and after, as the receiver did not measure"
+    if held.index and (void or matters(held)):
         whose = f"{plural(len(photos), 'photo')} ({found.name(photos[held.index[0]].path)} first)"
-        source.findings.append(replace(held.finding(whose), vehicle=vehicle))
+        source.findings.append(replace(held.finding(whose, void=bool(void)), vehicle=vehicle))
     steps_m = coarse_m(places)
     if steps_m > _COARSE_TOLD_M:
         for photo in photos:
@@ -410,6 +422,20 @@ def _measured(
     for i in sorted(lost):
         _leave_out(photos[i], vehicle, found.name(photos[i].path), _NOT_MEASURED, result)
     return [photo for i, photo in enumerate(photos) if i not in lost]
+
+
+def _altitudes_contradict(raised_m: Array) -> list[Finding]:
+    """A finding where altitudes by tables and by photos' own tags (N, 2), metres, are far apart."""
+    off_m = float(np.median(np.abs(raised_m[:, 0] - raised_m[:, 1]))) if len(raised_m) else 0.0
+    if off_m <= ALTITUDE_CONTRADICTS_M:
+        return []
+    table_m, own_m = np.median(raised_m, axis=0)
+    feet = "; these look like feet" if abs(table_m * _FOOT_M - own_m) < _LIKE_FEET * abs(own_m) else ""
+    text = (
+        f"tables put {plural(len(raised_m), 'picture')} at other altitudes than their tags, {table_m:.0f} m instead of "
+        f"{own_m:.0f} m, {metres(off_m)} apart (medians){feet}; the tables count: check their unit"
+    )
+    return [Finding("altitudes-contradict", text)]
 
 
 def _merge_tables(

@@ -5,6 +5,7 @@ as a single photo is ambiguous.
 """
 
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -18,10 +19,12 @@ from orthoswarm.model.arrays import Array
 from orthoswarm.model.earth import distance_m
 from orthoswarm.model.frame import Frame
 from telemetry.photos.maker_angles import Angles
-from telemetry.photos.photo_tags import HEMISPHERE_UNKNOWN, Photo, mirrored
+from telemetry.photos.map_datum import IN_DATUM
+from telemetry.photos.photo_tags import HEMISPHERE_UNKNOWN, VOID, Photo, mirrored
 from telemetry.samples.course import Straight, courses_deg, ground_track, straight_legs
 from telemetry.samples.findings import Finding, metres, plural
 from telemetry.samples.sample import Sample, fix_of
+from telemetry.samples.times import ZONE_CONTRADICTS
 
 LEAST_HEIGHT_M: Final = 1.0  # recorded heights below this were never filled in
 _RELATIVE_GIMBAL_MODELS = frozenset({"FC7203"})
@@ -43,13 +46,7 @@ def frames_of(
     ground = ground_track(photos)
     course = courses_deg(ground)
     heights = _heights(photos, findings, vehicle)
-    unsigned = sum(p.origin.get("position", "").endswith(HEMISPHERE_UNKNOWN) for p in photos)
-    if unsigned:
-        text = (
-            f"the GPS tags of {plural(unsigned, 'photo')} do not say whether north or south, east or west "
-            "(GPSLatitudeRef, GPSLongitudeRef), and are taken as north and east; give a geo.txt if that is wrong"
-        )
-        findings.append(Finding("position-hemisphere", text, vehicle))
+    findings += _doubts(photos, vehicle)
     chosen: dict[int, tuple[Angles, str]] = {}
     for model in sorted({p.model for p in photos}):
         index = [i for i, p in enumerate(photos) if p.model == model]
@@ -63,6 +60,34 @@ def frames_of(
         image = name(photo.path)
         frames.append(_frame(photo, vehicle, image, height_m=heights[i], angles=angles, yaw_origin=yaw_origin))
     return frames
+
+
+_DOUBTS: Final = (
+    (HEMISPHERE_UNKNOWN, "position-hemisphere", "the GPS tags of {} do not say whether north or south, east or west "
+     "(GPSLatitudeRef, GPSLongitudeRef), and are taken as north and east; give a geo.txt if that is wrong"),
+    (VOID, "position-void", "the positions of {} are void by the receiver's own word (GPSStatus V); they are used, as "
+     "some cameras always say so: check them"),
+    (IN_DATUM, "position-datum", "the GPS tags of {} name another datum than WGS 84 (GPSMapDatum): {}"),
+    (ZONE_CONTRADICTS, "time-zone", "the time zone that {} state contradicts the GPS time beside it, which counts"),
+)  # fmt: skip
+"""Words in the origin of a position or time that is not sure, the finding's code and text."""
+
+
+def _doubts(photos: Sequence[Photo], vehicle: str) -> list[Finding]:
+    """Findings on what the tags of a vehicle's photos leave open, or state wrongly."""
+    origins = [p.origin.get(name, "") for p in photos for name in ("position", "time")]
+    found = []
+    for words, code, text in _DOUBTS:
+        ends = Counter(origin.partition(words)[2] for origin in origins if words in origin)
+        found += [Finding(code, text.format(plural(n, "photo"), end), vehicle) for end, n in ends.items()]
+    return found
+
+
+def void_fixes(photos: Sequence[Photo]) -> set[int]:
+    """The photos whose receiver had no fix by its own word; none of a camera that says so of all that it placed."""
+    said = [p.origin.get("position", "") for p in photos]
+    tell = {p.model for p, origin in zip(photos, said) if origin.startswith(("EXIF", "XMP")) and VOID not in origin}
+    return {i for i, (p, origin) in enumerate(zip(photos, said)) if VOID in origin and p.model in tell}
 
 
 def settle_positions(photos: Sequence[Photo], vehicle: str, name: Callable[[Path], str]) -> list[Finding]:

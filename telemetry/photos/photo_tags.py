@@ -22,6 +22,7 @@ from telemetry.formats.photo import exif, xmp
 from telemetry.formats.photo.exif import parse_dji
 from telemetry.formats.photo.picture_container import Container, NotAPicture, read_container
 from telemetry.photos.maker_angles import Angles, camera_angles, flight_angles
+from telemetry.photos.map_datum import in_wgs84
 from telemetry.samples.sample import is_position
 from telemetry.samples.times import ZONE_UNKNOWN, epoch_of, parse_time
 from telemetry.samples.unreadable import Unreadable, read_or_reason
@@ -30,6 +31,9 @@ Run = Callable[..., Iterator[Any]]  # maps a function over items, in order
 
 HEMISPHERE_UNKNOWN = "without hemisphere, taken as north and east"
 """End of the origin of a position whose signs are not known."""
+
+VOID = "void by the receiver's own word (GPSStatus V)"
+"""Part of the origin of such a position: the receiver had no fix, or its camera always says so."""
 
 _FULL_FRAME_DIAGONAL_MM = 43.2666
 _SAME_LENS: Final = 0.1  # focal lengths by two tags differ by less (logarithm): rounding, crops of video modes
@@ -161,7 +165,9 @@ def tags_of(path: Path, container: Container) -> Photo:
 
 
 def _position(photo: Photo, tags: exif.Exif, found: xmp.Properties) -> None:
-    position, other, source = exif.gps_position(tags.gps), _xmp_position(found), "EXIF GPS"
+    position, other, source, datum = exif.gps_position(tags.gps), _xmp_position(found), "EXIF GPS", ""
+    if position is not None:
+        position, datum = in_wgs84(position, exif.text(tags.gps.get(18)))
     if position is None:
         position, other, source = other, None, "XMP position"
     elif not all(signs := exif.gps_signs(tags.gps)):
@@ -171,10 +177,11 @@ def _position(photo: Photo, tags: exif.Exif, found: xmp.Properties) -> None:
             lat, lon = (a if known else math.copysign(a, b) for a, b, known in zip(position, other, signs, strict=True))
             position, source = (lat, lon), "EXIF GPS, hemisphere from XMP"
     elif other is not None and mirrored(position, other):  # a hemisphere is one wrong letter
-        position, other, source = other, position, "XMP position"
+        position, other, source, datum = other, position, "XMP position", ""
     if position is not None:
         photo.lat_deg, photo.lon_deg = position
-        photo.origin["position"] = source
+        void = f", {VOID}" if exif.text(tags.gps.get(9)).upper() == "V" else ""
+        photo.origin["position"] = f"{source}{void}{datum}"
         if other is not None and distance_m(*position, *other) > CONTRADICTS_M:
             photo.other_position = other
     flag = xmp.number(found, "drone-dji:RtkFlag")

@@ -7,7 +7,7 @@ has no place but between those measured before and after, with the sigma of a wa
 """
 
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -41,6 +41,7 @@ _STRAIGHT_SHARE: Final = (
 )
 _ASTRAY_SHARE: Final = 0.6  # sigma of a way that nobody saw, to the next measured fix: a right angle is 1.5 of it off
 _FASTEST_M_S: Final = 100.0  # steps of times that were rounded to one second
+_LEAST_M_S: Final = 0.1  # no vehicle is quite at rest
 _AROUND: Final = 3  # steps before and after by which the speed around a fix is told
 
 
@@ -62,15 +63,18 @@ class HeldFixes:
         """Index, latitude, longitude and sigma of one after the other."""
         return zip(self.index, self.lat_deg.tolist(), self.lon_deg.tolist(), self.sigma_m.tolist(), strict=True)
 
-    def finding(self, of_what: str) -> Finding:
-        """What is said about them; of_what: whose they are."""
+    def finding(self, of_what: str, *, void: bool = False) -> Finding:
+        """What is said about them; of_what: whose they are. void: whether the receiver itself calls some so."""
         lost = int((self.sigma_m > LOST_SIGMA_M).sum())
         kept = len(self) - lost
         parts = [f"{kept} lie between those before and after (sigma up to {metres(self.told_m)})"] if kept else []
         parts += [f"{lost} are not used, as nothing tells where these were"] if lost else []
+        what = "repeat or foretell others although the vehicle flew on"
+        what = f"are void by the receiver's own word (GPSStatus V) or {what}" if void else what
+        why = "the receiver stood still or had no fix" if void else "the receiver stood still"
         text = (
-            f"{plural(len(self), 'position')} of {of_what} repeat or foretell others although the vehicle flew on, for "
-            f"up to {self.longest_s:.0f} s: the receiver stood still; {', '.join(parts)}"
+            f"{plural(len(self), 'position')} of {of_what} {what}, for up to {self.longest_s:.0f} s: {why}; "
+            f"{', '.join(parts)}"
         )
         return Finding("position-held", text)
 
@@ -80,21 +84,28 @@ class HeldFixes:
         return float(self.sigma_m[self.sigma_m <= LOST_SIGMA_M].max(initial=0.0))
 
 
-def held_fixes(times_s: Sequence[float | None], places: Sequence[tuple[float, float]]) -> HeldFixes:
+def held_fixes(
+    times_s: Sequence[float | None], places: Sequence[tuple[float, float]], void: Collection[int] = ()
+) -> HeldFixes:
     """The fixes of a flight that were not measured, and where the vehicle was.
 
     times_s: of the fixes, in one clock; what has none is not judged. places: latitude and longitude in degrees.
+    void: indices of those that were not measured by the receiver's own word.
     """
     order = sorted((i for i, t in enumerate(times_s) if t is not None and t == t), key=lambda i: times_s[i] or 0.0)
     none = np.zeros(0)
-    if len(order) < _FORETOLD_LEAST:
+    own = np.flatnonzero([i not in void for i in order])
+    if len(own) < _FORETOLD_LEAST:
         return HeldFixes([], none, none, none)
     times = np.array([times_s[i] for i in order], dtype=np.float64)
     ground = local_metres([places[i][0] for i in order], [places[i][1] for i in order])
-    speed = np.zeros(len(order))  # of the vehicle where a fix is held, 0 where it was measured
-    news_m = max(_NEWS_M, _NEWS_QUANTA * _quantum_m(np.array([places[i] for i in order])))
-    _mark_repeated(times, ground, speed, news_m)
-    _mark_foretold(times, ground, speed, news_m)
+    news_m = max(_NEWS_M, _NEWS_QUANTA * _quantum_m(np.array([places[order[i]] for i in own])))
+    pace = _over(np.hypot(*np.diff(ground[own], axis=0).T), np.diff(times[own]))
+    speed = np.full(len(order), np.clip(np.median(pace), _LEAST_M_S, _FASTEST_M_S))  # 0 below where it was measured
+    marks = np.zeros(len(own))
+    _mark_repeated(times[own], ground[own], marks, news_m)
+    _mark_foretold(times[own], ground[own], marks, news_m)
+    speed[own] = marks
     held, news = np.flatnonzero(speed > 0.0), np.flatnonzero(speed == 0.0)
     if not len(held) or not len(news):
         return HeldFixes([], none, none, none)

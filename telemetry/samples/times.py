@@ -4,6 +4,7 @@ import calendar
 import re
 
 ZONE_UNKNOWN = "without zone, taken as UTC"  # end of the origin of a time whose zone is not known
+ZONE_CONTRADICTS = "zone from GPS time, which the stated one contradicts"  # ... whose zone was stated otherwise
 GPS_EPOCH_S, WEEK_S = 315_964_800.0, 604_800.0
 """Start of GPS time (1980-01-06) in epoch seconds, and a GPS week in seconds."""
 GPS_MINUS_UTC_S, TAI_MINUS_UTC_S = 18.0, 37.0  # leap seconds since 2017 (IERS Bulletin C)

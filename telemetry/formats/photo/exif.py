@@ -10,7 +10,7 @@ import struct
 from dataclasses import dataclass, field
 
 from telemetry.samples.sample import Sample, is_position
-from telemetry.samples.times import ZONE_UNKNOWN, epoch_of, parse_offset, parse_time
+from telemetry.samples.times import ZONE_CONTRADICTS, ZONE_UNKNOWN, epoch_of, parse_offset, parse_time
 
 Value = str | bytes | tuple[float, ...]
 Tags = dict[int, Value]
@@ -178,24 +178,29 @@ def exposure_time(exif: Exif) -> tuple[float, str] | None:
 
     The camera's clock has sub-seconds but often no zone, the GPS stamp a zone but whole seconds and a lag: where
     both exist the stamp only determines the zone (to the quarter of an hour), unless the clock differs from it by more
-    than two minutes or was never set (`_by_both`).
+    than two minutes or was never set (`_by_both`). A zone that is written counts where the stamp gives no other: it may
+    be that of an editor, of another date in the file, or never set.
     """
-    written = text(exif.exif.get(DATE_ORIGINAL)) or text(exif.main.get(DATE_TIME))
+    changed = text(exif.main.get(DATE_TIME))
+    written = text(exif.exif.get(DATE_ORIGINAL)) or changed
     local = parse_time(written) or parse_time(written[:_WRITTEN_CHARACTERS])  # what follows is no part of it
     stamp = gps_time(exif.gps)
     if local is None:
         return None if stamp is None else (stamp, "EXIF GPS time")
     seconds, zoned = local
-    subsec = text(exif.exif.get(SUBSEC_ORIGINAL)) or text(exif.exif.get(SUBSEC))
+    own = written == changed  # SUBSEC and OFFSET_TIME belong to DATE_TIME
+    subsec = text(exif.exif.get(SUBSEC_ORIGINAL)) or (text(exif.exif.get(SUBSEC)) if own else "")
     if subsec.isdigit() and seconds == int(seconds):
         seconds += float(f"0.{subsec[:9]}")
-    if zoned:
-        return seconds, "EXIF time with zone"
-    offset = parse_offset(text(exif.exif.get(OFFSET_ORIGINAL)) or text(exif.exif.get(OFFSET_TIME)))
-    if offset is not None:
-        return seconds - offset, "EXIF time with zone"
+    zone = text(exif.exif.get(OFFSET_ORIGINAL)) or (text(exif.exif.get(OFFSET_TIME)) if own else "")
+    offset = 0.0 if zoned else parse_offset(zone)
     exposed = None if stamp is None else _by_both(seconds, stamp)
-    return exposed or (seconds, f"EXIF time {ZONE_UNKNOWN}")
+    if offset is None:
+        return exposed or (seconds, f"EXIF time {ZONE_UNKNOWN}")
+    stated = seconds - offset
+    if exposed and exposed[1] == _ZONE_OF_STAMP and abs(math.remainder(stated - exposed[0], _DAY_S)) > _MOST_LAG_S:
+        return exposed[0], f"EXIF time, {ZONE_CONTRADICTS}"
+    return stated, "EXIF time with zone"
 
 
 _DAY_S, _QUARTER_S, _MOST_LAG_S = 86_400.0, 900.0, 120.0
@@ -203,6 +208,7 @@ _WEST, _EAST = -11 * 4, 14 * 4  # the time zones in which people live, in quarte
 _ROLLOVER_DAYS = 1024 * 7
 """A receiver that counts weeks with ten bits is early by so much when they overflow (IS-GPS-200, 20.3.3.3.1.1)."""
 _YEAR_DAYS = 366
+_ZONE_OF_STAMP = "EXIF time, zone from GPS time"
 
 
 def _by_both(clock: float, stamp: float) -> tuple[float, str] | None:
@@ -227,7 +233,7 @@ def _by_both(clock: float, stamp: float) -> tuple[float, str] | None:
     if abs(days) <= 1:
         zone = round((clock - stamp) / _QUARTER_S) * _QUARTER_S
         if abs(clock - stamp - zone) < _MOST_LAG_S:
-            return clock - zone + days * _DAY_S, "EXIF time, zone from GPS time"
+            return clock - zone + days * _DAY_S, _ZONE_OF_STAMP
     return stamp, "EXIF GPS time"
 
 
