@@ -6,7 +6,7 @@ alpha, nodata, a rotated or different grid) are returned as 8-bit values and a v
 
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from orthoswarm.raster.map_check import sample_windows
 from orthoswarm.raster.tile_map import TileMap
 from orthoswarm.stores.addresses import address_of
 from orthoswarm.stores.listing import exists
+
+_LEAST_SHOWN: Final = 1e-3  # share of an area: a map that shows less of it is transparent or empty there
+_LOOK_PX: Final = 256  # pixels a side in which an area is looked at as a whole, finer than a road's corridor
 
 
 class Basemap:
@@ -86,7 +89,7 @@ class Basemap:
             )
 
     def require_readable(self, near: BoundingBox) -> None:
-        """Raise UnreadableMapError if the opened map is truncated or damaged where it is needed.
+        """Raise InputError if the opened map shows nothing where it is needed, or is truncated or damaged there.
 
         near: west, south, east, north of the area in its grid, metres. Only the map's part of it counts.
         """
@@ -94,9 +97,15 @@ class Basemap:
         if bounds.empty:
             return
         self._source.require_complete(bounds)
-        for gsd in self._source.gsds():
-            for window in sample_windows(bounds, gsd):
-                self.gray(window, gsd)
+        gsds = self._source.gsds()
+        valid = [self.gray(window, gsd)[1].mean() for gsd in gsds for window in sample_windows(bounds, gsd)]
+        # A map may be a narrow strip between all samples: only a look at everything, which takes longer, tells.
+        look_m = max(self.native_gsd_m, max(bounds.width, bounds.height) / _LOOK_PX)
+        if np.mean(valid) < _LEAST_SHOWN and self.gray(bounds, look_m)[1].mean() < _LEAST_SHOWN:
+            raise InputError(
+                f"the basemap {self.path.name} is transparent or empty in the area; give a map that shows it, or "
+                "export this one again without transparency"
+            )
 
     def gray(self, bounds: BoundingBox, gsd_m: float) -> tuple[Floats, Flags]:
         """Grey values and validity of a window.

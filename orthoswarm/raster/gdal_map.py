@@ -3,7 +3,8 @@
 import os
 import threading
 import warnings
-from collections.abc import Iterator
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -32,6 +33,10 @@ _MAP_PIXELS_AT_ONCE: Final = 8_000_000  # pixels of a map read at once (memory)
 _CUBIC_PX: Final = 2  # pixels on either side that cubic interpolation mixes
 _SAMPLE_SIDE: Final = 6  # windows a side of the lattice that is searched for plain fill ...
 _SAMPLE_PX: Final = 48  # ... and their side, pixels
+_OPAQUE_PERCENT: Final = 99.0  # of what is not transparent: a few brighter pixels say nothing of the rest
+_CLEAR_SHARE: Final = 0.05  # up to this share of the opaque value a pixel is transparent, with the noise of JPEG ...
+_SOLID_SHARE: Final = 0.9  # ... and from this on opaque: between lie edges of an alpha, but most of a picture, ...
+_ALPHA_VALUES: Final = 16  # ... in more values than layers of different opacity have
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,27 +66,31 @@ class RasterMap:
         self._path = path
         self._epsg = epsg
         self._handles = threading.local()
+        self._virtual: str | None = None
         source = self._open()
         self._crs = _crs_of(source, path)
-        self._factors = [int(f) for f in source.overviews(1)] if source.count else []
-        self._bands, self._alpha, self._palette = _band_roles(source)
         self.native_gsd_m, self.bounds = _placement(source, self._crs, path, epsg, near)
-        self._opaque = self._alpha is None and not any("nodata" in [f.name for f in m] for m in source.mask_flag_enums)
-        self._opaque &= not any("per_dataset" in [f.name for f in m] for m in source.mask_flag_enums)
         t = source.transform
         self._affine = _affine_of(source)
         self._aligned = t.b == 0 and t.d == 0 and t.a > 0 > t.e and self._crs.to_epsg() == epsg
-        eight_bit = all(source.dtypes[b - 1] == "uint8" for b in self._bands)
         self._ground, self._area = (-np.inf, np.inf), near or self.bounds
         with self._reading():
-            self._stretch = None if eight_bit or self._palette is not None else self._limits(epsg)
+            self._virtual = self._as_shown(source)
+        source = self._open()
+        self._bands, self._alpha = _band_roles(source)
+        self._opaque = self._alpha is None and not _mask_flags(source) & {"nodata", "per_dataset"}
+        self._factors = [int(f) for f in source.overviews(1)]
+        eight_bit = all(source.dtypes[b - 1] == "uint8" for b in self._bands)
+        with self._reading():
+            self._stretch = None if eight_bit else self._limits(epsg)
 
-    def _open(self, level: int | None = None) -> Any:
+    def _open(self, level: int | None = None, as_shown: bool = True) -> Any:
         import rasterio
         from rasterio.errors import NotGeoreferencedWarning, RasterioIOError
 
         handles: dict[Any, Any] = self._handles.__dict__
-        key = (os.getpid(), level)
+        virtual = self._virtual if as_shown else None
+        key = (os.getpid(), level, virtual)
         if key not in handles:
             options: dict[str, Any] = {} if level is None else {"OVERVIEW_LEVEL": level}
             # Of a local map side files are looked for one by one (world file, .aux.xml, .msk, .ovr) without listing its
@@ -90,12 +99,53 @@ class RasterMap:
             try:
                 with warnings.catch_warnings(), rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN=side_files):
                     warnings.simplefilter("ignore", NotGeoreferencedWarning)  # reported as an error in plain words
-                    handles[key] = rasterio.open(local_file(self._path), **options)
+                    file = local_file(self._path)
+                    handles[key] = rasterio.open(virtual or file, **options)
             except (RasterioIOError, OSError):
                 raise UnreadableMapError(
                     f"the basemap {self._path.name} cannot be read as a map; give a GeoTIFF, COG, MBTiles or XYZ folder"
                 ) from None
         return handles[key]
+
+    def _as_shown(self, source: Any) -> str | None:
+        """A virtual raster (VRT) of the file that is what it says; None if the file itself is.
+
+        A palette becomes colours, and an alpha's opaque value its highest. A picture that is labelled alpha, as
+        programs label any fourth band, becomes a band without a meaning. Overviews without the file's mask, by which
+        all of them would be valid, are left out; GDAL does so itself.
+        """
+        from rasterio.enums import ColorInterp
+
+        roles = list(source.colorinterp)
+        if not {ColorInterp.alpha, ColorInterp.palette} & set(roles) and "per_dataset" not in _mask_flags(source):
+            return None
+        root = virtual_raster(source)
+        bands = stored = root.findall("VRTRasterBand")
+        if ColorInterp.alpha in roles:
+            at = roles.index(ColorInterp.alpha)
+            kind, full = stored[at].get("dataType", "Byte"), _alpha_range(source.dtypes[at])
+            opaque = self._opaque_value(at + 1, full)
+            if opaque is None or opaque <= 0.5 * full:
+                role, scale = ("Undefined", 1.0) if opaque is None else ("Alpha", full / opaque)
+                band = virtual_band(source, at + 1, role, kind, ScaleRatio=scale)
+                bands = [*stored[:at], band, *stored[at + 1 :]]
+        if ColorInterp.palette in roles:
+            alphas = [band for band in bands if band.findtext("ColorInterp") == "Alpha"]
+            bands = [*_palette_colours(source, roles.index(ColorInterp.palette) + 1), *alphas][:4]
+        if bands == stored and ColorInterp.alpha in roles:
+            return None
+        root[:] = [*(part for part in root if part not in stored), *bands]
+        return ET.tostring(root, "unicode")
+
+    def _opaque_value(self, band: int, full: float) -> float | None:
+        """What a band labelled alpha holds where the map is opaque, full if no sample tells; None of a picture."""
+        values = np.concatenate([np.zeros(0), *(window.ravel() for window in self._samples([band]))])
+        if not (values > 0).any():
+            return full
+        opaque = float(np.percentile(values[values > 0], _OPAQUE_PERCENT))
+        seen = values[values > _CLEAR_SHARE * opaque]
+        middle = seen[seen < _SOLID_SHARE * opaque]
+        return None if 2 * len(middle) > len(seen) and len(np.unique(middle)) > _ALPHA_VALUES else opaque
 
     def gsds(self) -> list[float]:
         """A pixel size for each stored resolution, metres."""
@@ -105,10 +155,10 @@ class RasterMap:
         """Raise UnreadableMapError if the file is too short for its blocks within bounds (in the area's grid)."""
         from rasterio.warp import transform_bounds
 
-        source = self._open()
         west, south, east, north = transform_bounds(f"EPSG:{self._epsg}", self._crs, *bounds, densify_pts=5)
         corners = np.array([_apply(~self._affine, x, y) for x in (west, east) for y in (south, north)])
         (c0, r0), (c1, r1) = np.floor(corners.min(axis=0)), np.ceil(corners.max(axis=0))
+        source = self._open(as_shown=False)
         rows, cols = np.clip([r0, r1], 0, source.height), np.clip([c0, c1], 0, source.width)
         if ends_early(source, local_file(self._path), (int(rows[0]), int(rows[1]), int(cols[0]), int(cols[1]))):
             raise UnreadableMapError(f"the basemap {self._path.name} is cut short; copy or export it again")
@@ -126,8 +176,6 @@ class RasterMap:
     def read(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Flags]:
         """Values uint8 (bands, rows, columns), one or three bands (one if grey is enough), and their validity."""
         with self._reading():
-            if self._palette is not None:
-                return self._read_palette(grid)
             if self._aligned:
                 parts = [self._read_aligned(part, gray) for part in self._bands_of(grid)]
                 return parts[0] if len(parts) == 1 else _below_each_other(parts)
@@ -164,10 +212,10 @@ class RasterMap:
     def _fills(self) -> list[tuple[float, ...]]:
         """Colours in which the map is plain without being ground, besides black and white."""
         low, high = self._ground
-        return [colour for colour in fills(self._samples()) if low < min(colour) and max(colour) < high]
+        return [colour for colour in fills(self._samples(self._bands)) if low < min(colour) and max(colour) < high]
 
-    def _samples(self) -> Iterator[NDArray[Any]]:
-        """Windows of the map at its own resolution, spread over the area."""
+    def _samples(self, bands: Sequence[int]) -> Iterator[NDArray[Any]]:
+        """Windows of bands of the map at its own resolution, spread over the area."""
         from rasterio.windows import Window
 
         source = self._open()
@@ -176,7 +224,7 @@ class RasterMap:
             top = min(max(r - _SAMPLE_PX // 2, 0), max(source.height - _SAMPLE_PX, 0))
             size = min(_SAMPLE_PX, source.width), min(_SAMPLE_PX, source.height)
             with suppress(self._error):  # what is damaged is told where it is needed
-                yield source.read(self._bands, window=Window(left, top, *size))
+                yield source.read(bands, window=Window(left, top, *size))
 
     def _lattice(self, bounds: BoundingBox) -> Iterator[tuple[int, int]]:
         """Columns and rows of the map at places spread over bounds, those inside it."""
@@ -259,21 +307,6 @@ class RasterMap:
         valid = bands[-1] > 0.5 * full
         return bands[:-1], valid
 
-    def _read_palette(self, grid: GroundGrid) -> tuple[Bytes, Flags]:
-        """Read a palette map three times finer and average the colours, as palette numbers cannot be averaged."""
-        import cv2
-
-        west, _, _, north = grid.bounds
-        fine = GroundGrid(
-            epsg=grid.epsg, west=west, north=north, gsd_m=grid.gsd_m / 3, width=3 * grid.width, height=3 * grid.height
-        )
-        index, valid = self._warp(fine, nearest=True)
-        assert self._palette is not None
-        size = (grid.width, grid.height)
-        colours = cv2.resize(self._palette[index[0]], size, interpolation=cv2.INTER_AREA)
-        share = cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-        return np.ascontiguousarray(colours.transpose(2, 0, 1)), share > 0.5
-
     def _limits(self, epsg: int) -> _Stretch:
         """Percentiles of the map near the area, from about half a million pixels."""
         west, south, east, north = self.bounds
@@ -308,6 +341,12 @@ def luma(data: Bytes) -> Bytes:
 
 def _crs_of(source: Any, path: Path) -> Any:
     """The raster's CRS, from its ground control points where it has no transform, or of a .prj beside a world file."""
+    if not source.count:
+        parts = source.subdatasets or [path.name]
+        raise InputError(
+            f"the basemap {path.name} holds {len(parts)} rasters ({', '.join(parts)}); extract one of them "
+            f"(gdal_translate '{parts[0]}' map.tif) and give that"
+        )
     crs = source.crs or source.gcps[1] or (None if source.transform.is_identity else _crs_beside(path))
     if source.crs and source.transform.is_identity and not source.gcps[0] and not source.rpcs:
         crs = None
@@ -334,23 +373,60 @@ def _crs_beside(path: Path) -> Any:
         return None
 
 
-def _band_roles(source: Any) -> tuple[list[int], int | None, Bytes | None]:
-    """Band numbers of the picture (one or three), of the alpha, and the palette as uint8 (256, 3)."""
+def _band_roles(source: Any) -> tuple[list[int], int | None]:
+    """Band numbers of the picture (one or three) and of the alpha."""
     from rasterio.enums import ColorInterp
 
     roles = list(source.colorinterp)
     alpha = roles.index(ColorInterp.alpha) + 1 if ColorInterp.alpha in roles else None
-    if ColorInterp.palette in roles:
-        palette = np.zeros((256, 3), np.uint8)
-        for value, colour in source.colormap(roles.index(ColorInterp.palette) + 1).items():
-            if value < 256:
-                palette[value] = colour[:3]
-        return [roles.index(ColorInterp.palette) + 1], alpha, palette
     colours = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
     if all(c in roles for c in colours):
-        return [roles.index(c) + 1 for c in colours], alpha, None
+        return [roles.index(c) + 1 for c in colours], alpha
     plain = [i + 1 for i in range(source.count) if i + 1 != alpha]
-    return (plain[:3] if len(plain) >= 3 else plain[:1]), alpha, None
+    return (plain[:3] if len(plain) >= 3 else plain[:1]), alpha
+
+
+def _mask_flags(source: Any) -> set[str]:
+    """GDAL's names of all that tells which pixels are valid."""
+    return {flag.name for band in source.mask_flag_enums for flag in band}
+
+
+def virtual_raster(source: Any) -> ET.Element:
+    """GDAL's description (VRT) of an open raster; changed as XML, it can be opened in the raster's place."""
+    import rasterio.shutil
+    from rasterio.io import MemoryFile
+
+    with MemoryFile(ext=".vrt") as file:
+        rasterio.shutil.copy(source, file.name, driver="VRT")
+        root = ET.fromstring(file.read())
+    for name in root.iter("SourceFilename"):
+        name.set("shared", "0")  # a file that is shared with the process this one was forked from would be read by both
+    return root
+
+
+def virtual_band(source: Any, number: int, role: str, kind: str, **how: Any) -> ET.Element:
+    """A band of a virtual raster whose values are changed as they are read.
+
+    source, number: the open raster and its band. role, kind: meaning and data type, as GDAL names them. how: elements
+    of a VRT's ComplexSource (https://gdal.org/drivers/raster/vrt.html).
+    """
+    high, wide = source.block_shapes[number - 1]
+    band = ET.Element("VRTRasterBand", dataType=kind, blockXSize=str(wide), blockYSize=str(high))
+    ET.SubElement(band, "ColorInterp").text = role
+    values = ET.SubElement(band, "ComplexSource")
+    ET.SubElement(values, "SourceFilename", shared="0").text = source.name
+    for name, value in {"SourceBand": number, **how}.items():
+        ET.SubElement(values, name).text = str(value)
+    return band
+
+
+def _palette_colours(source: Any, number: int) -> list[ET.Element]:
+    """Bands of a palette's colours, and of their alpha where some are transparent."""
+    nodata = source.nodatavals[number - 1]
+    clear = nodata is not None or any(colour[3] < 255 for colour in source.colormap(number).values())
+    how = {} if nodata is None else {"NODATA": nodata}
+    roles = ("Red", "Green", "Blue", "Alpha")[: 4 if clear else 3]
+    return [virtual_band(source, number, r, "Byte", ColorTableComponent=i, **how) for i, r in enumerate(roles, 1)]
 
 
 def _placement(source: Any, crs: Any, path: Path, epsg: int, near: BoundingBox | None) -> tuple[float, BoundingBox]:

@@ -2,6 +2,7 @@
 
 import re
 import warnings
+import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -15,6 +16,7 @@ from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.coordinate_system import require_datum
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import Terrain
+from orthoswarm.raster.gdal_map import virtual_band, virtual_raster
 from orthoswarm.stores.addresses import address_of
 from orthoswarm.stores.listing import exists
 from orthoswarm.stores.local_copies import local_file
@@ -38,6 +40,9 @@ _NO_UNIT = frozenset({"unknown", "none", "unitless", "1"})
 
 _BETWEEN_NODES = 1.5  # how far the nodes around a place and the node of a pixel are from them, together, in steps
 
+_LOWEST_M: Final = -600.0  # below this no land lies over any datum (the least is -430 m): it is a void, as is what ...
+_HIGHEST_M: Final = 12_000.0  # ... lies above this; feet that are taken for metres are below it nearly everywhere
+_VOID_M: Final = -1e6  # a void's height until pixels are mixed, which leaves it out
 _DEM_FINEST_M: Final = 2.0  # finest distance of the nodes on which a height model is read
 _DEM_MEAN_STEPS: Final = 0.7  # where its pixels are smaller than so many distances of nodes, a node has their mean ...
 _DEM_HIGHEST_STEPS: Final = 1.5  # ... or the highest of them where the highest ground is asked for
@@ -195,25 +200,41 @@ def _on_area(
             columns, rows = int(np.ceil((east - left) / step)) + 1, int(np.ceil((north - low) / step)) + 1
             # a pixel about every node: its centre is the node
             transform = rasterio.Affine(step, 0.0, left - 0.5 * step, 0.0, -step, low + (rows - 0.5) * step)
-            with WarpedVRT(
-                dataset,
-                crs=f"EPSG:{epsg}",
-                transform=transform,
-                width=columns,
-                height=rows,
-                resampling=getattr(Resampling, _resampling(pixel / step, highest_step_m is not None)),
-                src_nodata=_nodata(dataset),
-                nodata=float("nan"),
-                dtype="float64",
-                add_alpha=False,
-            ) as warped:
+            with (
+                rasterio.open(_in_metres(dataset, name)) as heights,
+                WarpedVRT(
+                    heights,
+                    src_crs=dataset.crs,
+                    crs=f"EPSG:{epsg}",
+                    transform=transform,
+                    width=columns,
+                    height=rows,
+                    resampling=getattr(Resampling, _resampling(pixel / step, highest_step_m is not None)),
+                    src_nodata=_VOID_M,
+                    nodata=float("nan"),
+                    dtype="float64",
+                    add_alpha=False,
+                ) as warped,
+            ):
                 z = warped.read(1).astype(np.float64)
         except RasterioError as error:
             raise InputError(f"{name} cannot be read as heights ({error}); check the file") from None
-        z = z * float(dataset.scales[0] or 1.0) + float(dataset.offsets[0] or 0.0)
-        z *= _unit_m(str(dataset.units[0] or ""), name)
-    z[~np.isfinite(z) | (z > 12000.0) | (z < -1000.0)] = np.nan  # impossible heights
     return np.ascontiguousarray(z[::-1]), left, low, step
+
+
+def _in_metres(dataset: Any, name: str) -> str:
+    """A virtual raster (VRT) of a DEM's heights in metres in which voids, declared or not, are `_VOID_M`."""
+    unit = _unit_m(str(dataset.units[0] or ""), name)
+    scale, offset = float(dataset.scales[0] or 1.0), float(dataset.offsets[0] or 0.0)
+    (low, first), (high, last) = sorted(((m / unit - offset) / scale, m) for m in (_LOWEST_M, _HIGHEST_M))
+    below, above = float(np.nextafter(low, -np.inf)), float(np.nextafter(high, np.inf))
+    table = {below: _VOID_M, low: first, high: last, above: _VOID_M}  # stored value -> metres, straight in between
+    how = {} if dataset.nodata is None else {"NODATA": dataset.nodata}
+    heights = virtual_band(dataset, 1, "Gray", "Float64", LUT=",".join(f"{x}:{y}" for x, y in table.items()), **how)
+    ET.SubElement(heights, "NoDataValue").text = str(_VOID_M)
+    root = virtual_raster(dataset)
+    root[:] = [*(part for part in root if part.tag != "VRTRasterBand"), heights]
+    return ET.tostring(root, "unicode")
 
 
 def _unit_m(unit: str, name: str) -> float:
@@ -243,15 +264,6 @@ def _unit_among(words: list[str]) -> float | None:
         if known:
             return next((metres for metres in known if metres in (0.3048, _US_FOOT_M)), known[0])
     return 1.0 if not words or _NO_UNIT & set(words) else None
-
-
-def _nodata(dataset: Any) -> float | None:
-    """The nodata value, also where a file does not declare its -32768, -9999 or -3.4e38."""
-    if dataset.nodata is not None:
-        return float(dataset.nodata)
-    small = dataset.read(1, out_shape=(min(dataset.height, 512), min(dataset.width, 512)))
-    lowest = float(np.nanmin(small)) if np.isfinite(small).any() else 0.0
-    return lowest if lowest < -1000.0 else None
 
 
 def _pixel_m(dataset: Any, epsg: int, bounds: BoundingBox) -> float:

@@ -32,6 +32,7 @@ Ranges = Callable[[int], tuple[int, int, int, int]]
 """Zoom -> first and last column, first and last row (from the north), inclusive."""
 
 _SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp")
+_VECTOR_TILE: Final = (b"\x1f\x8b", b"\x1a")  # gzip, in which they are delivered, or their first layer
 _PART_BYTES: Final = 256  # of a tile's middle, by which tiles of one size are compared
 Place = tuple[int, int, int]
 """Zoom, column, and row from the north."""
@@ -84,6 +85,8 @@ class TileMap:
             tile = _decode(self._source.read(self._tiles[place]))
             if tile is not None:
                 return len(tile)
+        if any(self._source.read(self._tiles[place]).startswith(_VECTOR_TILE) for place in places):
+            raise InputError(f"{self._path} holds vector tiles (pbf); give a map of raster tiles (png, jpg or webp)")
         if places:
             raise InputError(f"the map tiles of {self._path} cannot be decoded; download the tiles again")
         return 256
