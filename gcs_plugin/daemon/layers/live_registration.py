@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 
 Bytes = NDArray[np.uint8]
 
-_FIRST: Final = 20  # pictures of a vehicle that are looked for on the basemap together
+FIRST: Final = 20  # pictures of a vehicle that are looked for on the basemap together
 MOST_LOOKED_FOR: Final = 60  # ... of many that were not found, the newest
-_MORE: Final = 1.4  # ... again when there are so many times as many
+MORE: Final = 1.4  # ... again when there are so many times as many
 _ANSWER_S: Final = 60.0  # an answer that has not come by then was lost with its job
 _BUSY: Final = 50  # waiting pictures for each further one that is only placed by its neighbours
 _MOST_BETWEEN: Final = 3  # most pictures in a row that are: corners have to be followed across them
@@ -48,7 +48,7 @@ class _Flown:
     waiting: list[PendingFrame] = field(default_factory=list)
     came: int = 0
     block: "LiveBlock | None" = None
-    wanted: int = _FIRST
+    wanted: int = FIRST
     asked_s: float = -_ANSWER_S
     between: int = 0
 
@@ -94,7 +94,7 @@ class LiveRegistration:
         whose = (pending.frame.vehicle, pending.sortie)
         flown = self._flown.get(whose)
         if flown is None:  # of a sortie that was under way before a restart, those from before count
-            flown = self._flown[whose] = _Flown(came=min(self._drawn(whose), _FIRST - 1))
+            flown = self._flown[whose] = _Flown(came=min(self._drawn(whose), FIRST - 1))
         if flown.block is not None and _size(flown.block.newest) != _size(pending.frame):
             return None  # another lens than the one that was found
         pose = None if flown.block is None else self._next(flown, pending, picture, waiting)
@@ -123,7 +123,7 @@ class LiveRegistration:
             _log.info("%s is lost on the basemap: %s", frame.vehicle, error)
             pose = None
         if pose is None:
-            flown.block, flown.waiting, flown.came, flown.wanted = None, [], 0, _FIRST
+            flown.block, flown.waiting, flown.came, flown.wanted = None, [], 0, FIRST
         return pose
 
     def found(self, area: MapArea) -> "Iterator[tuple[PendingFrame, LivePose]]":
@@ -135,7 +135,7 @@ class LiveRegistration:
                 continue
             flown.asked_s = -_ANSWER_S
             if event.solution is None or event.epsg != area.epsg:
-                flown.wanted = int(_MORE * max(flown.came, flown.wanted))
+                flown.wanted = int(MORE * max(flown.came, flown.wanted))
                 continue
             try:
                 yield from self._begun(flown, event, area)
@@ -153,7 +153,7 @@ class LiveRegistration:
         state, origin = event.solution.state, np.array(area.origin)
         block = LiveBlock(state, LocalGrid(area.epsg), origin, Basemap.open(self._basemap, area.epsg))
         placed = {p.frame.image: p for p in event.solution.placed}
-        waiting, flown.waiting, flown.wanted, flown.block = flown.waiting, [], _FIRST, block
+        waiting, flown.waiting, flown.wanted, flown.block = flown.waiting, [], FIRST, block
         for pending in waiting:
             first = placed.get(pending.frame.image)
             if first is not None:
