@@ -37,7 +37,8 @@ _LEANS_M: Final = 0.5  # what stands may be so far from where it is drawn: more 
 _CELL_M: Final = 1.0  # least side of a cell
 _MOST_CELLS: Final = 2_000_000  # cells are larger where there would be more (memory, time)
 _CUT_SHARE: Final = 0.05  # a second picture with less of an object only touches its edge
-_CUT_M: Final = 1.0  # objects are higher than this
+_CUT_M: Final = 1.0  # objects are higher than this ...
+_OBJECT_CELLS: Final = 4  # ... and as large as so many cells, else the cells do not tell by what they are drawn
 _TEETH_M: Final = 6.0  # sigma by which the outline is smoothed: pictures are a few times as far apart
 _SIDE: Final = 0.05  # so much of what is drawn lies along each side
 _DOUBTFUL_SIDE: Final = 0.4  # share of it that makes a side one for orientation
@@ -267,7 +268,8 @@ def _cut_objects(terrain: Terrain, grid: GroundGrid, shown: Ints) -> tuple[int, 
     owner = pairs // (int(shown.max()) + 1)
     large = cells > _CUT_SHARE * np.bincount(of, minlength=count)[owner]
     parts = np.bincount(owner[large], minlength=count)[1:]
-    return int((parts > 0).sum()), int((parts > 1).sum())
+    wide = np.bincount(of, minlength=count)[1:] * terrain.step_m**2 >= _OBJECT_CELLS * grid.gsd_m**2
+    return int(wide.sum()), int((wide & (parts > 1)).sum())
 
 
 def _changed(gain: Field | None) -> bool:
