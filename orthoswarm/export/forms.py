@@ -7,13 +7,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final
 
 from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.model.errors import InputError
 
 if TYPE_CHECKING:
     from orthoswarm.export.tactical.places import Place
+    from orthoswarm.export.tiles.mbtiles import Format
 
 _NO_PLACES: Final = "there are no finds and no vehicles; `orthoswarm serve` keeps them as places.geojson in its folder"
 
@@ -30,7 +31,7 @@ class MapExport:
     # `images`, or where they were when the map was made
     find: Callable[[Mapping[str, Any]], Path | None] | None = None
     images: Path | None = None
-    tile_format: Literal["png", "webp", "jpg"] = "png"  # of MBTiles
+    tile_format: "Format" = "png"  # of MBTiles
     quality: int = 85  # of JPEG and WebP, 1 to 100
     epsg: int | None = None  # of the COG
     jpeg: bool = False  # of the COG

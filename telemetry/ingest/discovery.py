@@ -15,8 +15,7 @@ from orthoswarm.model.errors import InputError
 from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
 from orthoswarm.stores.addresses import address_of, is_stored
 from orthoswarm.stores.listing import exists, is_file, list_folder
-from telemetry.formats.log.can_log import SUFFIXES as CAN_LOGS
-from telemetry.formats.log.receiver_track import TRACK_SUFFIXES
+from telemetry.formats.log.flight_logs import LOG_SUFFIXES
 from telemetry.photos.photo_tags import read_photo, sensor_of_name
 from telemetry.samples.unreadable import Unreadable, read_or_reason
 
@@ -24,7 +23,6 @@ VIDEO_SUFFIXES = frozenset(
     {".mp4", ".mov", ".m4v", ".ts", ".m2ts", ".mts", ".mpg", ".mpeg", ".mkv", ".flv", ".avi"}
     | {".h264", ".264", ".avc", ".h265", ".265", ".hevc", ".webm"}
 )
-LOG_SUFFIXES = frozenset({".tlog", ".bin", ".ulg", ".pos", ".mrk"}) | CAN_LOGS | TRACK_SUFFIXES
 UNREAD_SUFFIXES = frozenset(
     {".fit", ".tcx", ".igc", ".kml", ".kmz", ".plt", ".ubx", ".sbf", ".obs", ".rnx", ".rtk", ".dat", ".bag", ".mcap"}
     | {".json", ".geojson", ".xml", ".gpkg", ".shp", ".xlsx", ".ods", ".xmp"}

@@ -236,7 +236,8 @@ class FolderReader:
 
     def __init__(self, folder: Path, intake: VehicleIntake) -> None:
         from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
-        from telemetry.ingest.discovery import LOG_SUFFIXES, VIDEO_SUFFIXES
+        from telemetry.formats.log.flight_logs import LOG_SUFFIXES
+        from telemetry.ingest.discovery import VIDEO_SUFFIXES
 
         self.folder, self._intake = folder, intake
         self.state = "waiting"

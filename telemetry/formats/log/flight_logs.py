@@ -8,6 +8,7 @@ import mmap
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -22,7 +23,14 @@ from telemetry.formats.log.ulog import read_ulog
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 
-__all__ = ["FlightLog", "NotALog", "read_log", "read_tlog"]
+__all__ = ["LOG_SUFFIXES", "FlightLog", "NotALog", "read_log", "read_tlog"]
+
+OF_ONE_VEHICLE: Final[dict[str, Callable[[Path], FlightLog]]] = {
+    ".bin": read_dataflash, ".ulg": read_ulog, ".pos": read_exposure_list, ".mrk": read_exposure_list,
+    **dict.fromkeys(CAN_LOGS, read_can_log), **dict.fromkeys(TRACK_SUFFIXES, read_track),
+}  # fmt: skip
+"""Reader of each kind of log, by its suffix; a tlog may be of several vehicles."""
+LOG_SUFFIXES: Final = frozenset({".tlog", *OF_ONE_VEHICLE})
 
 
 def read_log(path: Path) -> list[FlightLog]:
@@ -30,16 +38,10 @@ def read_log(path: Path) -> list[FlightLog]:
 
     Raises NotALog: it is not a flight log, or holds nothing that can be used.
     """
-    of_one_vehicle: dict[str, Callable[[Path], FlightLog]] = {
-        ".bin": read_dataflash, ".ulg": read_ulog, ".pos": read_exposure_list, ".mrk": read_exposure_list,
-        **dict.fromkeys(CAN_LOGS, read_can_log), **dict.fromkeys(TRACK_SUFFIXES, read_track),
-    }  # fmt: skip
     suffix = path.suffix.lower()
-    reader = of_one_vehicle.get(suffix)
-    if reader is None and suffix != ".tlog":
-        raise NotALog(
-            "the file is not a flight log (.tlog, .BIN, .ulg, .pos, .MRK, .gpx, .nmea, .log, .asc, .blf, .trc)"
-        )
+    reader = OF_ONE_VEHICLE.get(suffix)
+    if suffix not in LOG_SUFFIXES:
+        raise NotALog(f"the file is not a flight log ({', '.join(sorted(LOG_SUFFIXES))})")
     try:
         if path.stat().st_size == 0:
             raise NotALog("the log is empty; copy it again")

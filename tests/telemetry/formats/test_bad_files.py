@@ -81,7 +81,7 @@ READERS = [
     (geo_txt, "read_geo_txt", make_geo_txt),
     (pose_csv, "read_pose_csv", make_csv),
     (log_ingest, "read_log", make_log),
-    (flight_logs, "read_ulog", make_log),
+    (flight_logs.OF_ONE_VEHICLE, ".ulg", make_log),
     (video_ingest, "scan", make_clip),
     (video_ingest, "Poses", make_clip),
     (video_ingest, "extract", make_clip),
@@ -97,12 +97,13 @@ def test_any_exception_of_any_reader_names_its_file_and_ends_nothing(tmp_path, m
     else:
         good_photo(tmp_path / "other")
     name = make(tmp_path)
-    whole = getattr(module, reader)
+    of_table = isinstance(module, dict)
+    whole = module[reader] if of_table else getattr(module, reader)
 
     def fails(*args, **options):
         return whole(*args, **options) if GOOD in str(args[0]) else broken()
 
-    monkeypatch.setattr(module, reader, fails)
+    (monkeypatch.setitem if of_table else monkeypatch.setattr)(module, reader, fails)
     found = survey([tmp_path], options=LoadOptions(cache=tmp_path / ".cache"))
     assert [frame.image.rsplit("/", 1)[-1] for frame in found.frames()] == [GOOD]
     assert name in named(found)
