@@ -95,7 +95,7 @@ class SurveyPoints:
             read = read_checkpoints(path)
         if len(read) > _MOST_POINTS:
             raise InputError(f"the table holds {len(read)} points; send at most {_MOST_POINTS}")
-        frames = self._by_name() if any(p.marks for p in read) else {}
+        frames = dict(self._named()) if any(p.marks for p in read) else {}
         with self._lock:
             known = {point["name"]: point for point in self._points()}
             points = []
@@ -110,11 +110,11 @@ class SurveyPoints:
         self._events.tell("points")
         return self.rows()
 
-    def _by_name(self) -> dict[str, FrameRow]:
-        """Pictures by what a table calls them: their names, with the vehicle as folder where several have one."""
+    def _named(self) -> list[tuple[str, FrameRow]]:
+        """What a table calls each picture: its name, with the vehicle as folder where several have it."""
         rows = list(all_frames(self._journal))
         count = Counter(row.image for row in rows)
-        return {row.image if count[row.image] == 1 else f"{row.vehicle}/{row.image}": row for row in rows}
+        return [(row.image if count[row.image] == 1 else f"{row.vehicle}/{row.image}", row) for row in rows]
 
     def mark(self, body: Mapping[str, Any]) -> list[PointRow]:
         """Mark a point (`name`) in a picture (`seq`) at `column` and `row`, or not any more where these are null.
@@ -153,7 +153,7 @@ class SurveyPoints:
         Raises:
             InputError: a picture's name has a blank, which ends a name there.
         """
-        names = {row.seq: name for name, row in self._by_name().items()}
+        names = {row.seq: name for name, row in self._named()}
         marks = [(row, mark, names[mark["seq"]]) for row in self.rows() for mark in row["marks"]]
         if blank := next((name for *_, name in marks if len(name.split()) != 1), None):
             raise InputError(f"{blank} has a blank in its name, which gcp_list.txt cannot hold; take away its mark")

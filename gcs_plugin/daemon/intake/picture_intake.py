@@ -156,7 +156,7 @@ class PictureIntake:
 
     def _aged(self, pose: PostedPose, time_s: float) -> PostedPose:
         """The pose, with how far the vehicle may have flown since its receiver had news."""
-        if not pose.has_fix:
+        if pose.by_link or not pose.has_fix:
             return pose
         held_m = self._news[pose.vehicle].hear(time_s, (pose.values["lat_deg"], pose.values["lon_deg"]), None)
         return replace(pose, values=pose.values | {"held_m": held_m}) if held_m > UNSTATED_SIGMA_M else pose

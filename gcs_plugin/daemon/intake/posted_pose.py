@@ -4,7 +4,7 @@ Poses from files and links take the same form.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
@@ -44,6 +44,7 @@ class PostedPose:
             `damaged`: True for a picture that lost parts; `held_m`: how far the vehicle may have flown since its
             receiver had news, where that is more than a receiver's noise.
         origin: sources of position, height, angles and time, as far as known.
+        by_link: it comes from the vehicle's link, which has left out positions that its receiver only repeats.
     """
 
     vehicle: str
@@ -51,6 +52,8 @@ class PostedPose:
     time_s: float | None
     values: dict[str, float]
     origin: dict[str, str] = field(default_factory=dict)
+    _: KW_ONLY
+    by_link: bool = False
 
     @property
     def has_fix(self) -> bool:
@@ -163,7 +166,11 @@ def linked_pose(poses: LinkPoses, vehicle: str, name: str, time_s: float | None)
     """What a vehicle's link and bus say of a picture as if it had been posted; None without a time or a position."""
     linked = None if time_s is None else poses.at(vehicle, time_s)
     values = None if linked is None else pose_values(linked.sample)
-    return None if linked is None or values is None else PostedPose(vehicle, name, time_s, values, linked.origin)
+    return (
+        None
+        if linked is None or values is None
+        else PostedPose(vehicle, name, time_s, values, linked.origin, by_link=True)
+    )
 
 
 def posted_frame(frame: Frame, vehicle: str, name: str) -> PostedPose:
